@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import AfterValidator, Field, SerializerFunctionWrapHandler, StrictInt, model_serializer, model_validator
 
 from patchproof.base.goal import Goal
 from patchproof.base.validation import (
@@ -132,9 +132,9 @@ class SheetSettings(StrictModel):
 class TargetSettings(StrictModel):
     """The label to recognize, and the networks."""
 
-    label: str | int  # an index, or a name in the first network's list
+    label: str | StrictInt  # an index, or a name in the first network's list
     models: Annotated[tuple[str, ...], Field(min_length=1)]  # optimized for together; the first one is judged
-    accept: tuple[str | int, ...] = ()  # labels that count as recognized, too
+    accept: tuple[str | StrictInt, ...] = ()  # labels that count as recognized, too
     goal: Goal = Goal.assist  # raise the label's rate, or lower it
     least_score: Share | None = None  # smallest score of a detector's box that counts; by default its own, or 0.5
 

@@ -22,10 +22,10 @@ from patchproof.base.workers import open_workers
 from patchproof.calibrate.chart import PRIORS, printer_of
 from patchproof.channel.print_colors import INK_TERMS, CellColors, ShownColors, add_ink, fit_ink_and_photos
 from patchproof.channel.printer import Printer, load_printer, node_colors, printer_output
-from patchproof.evidence.annotations import corners_of_photo
+from patchproof.evidence.annotations import corners_of_photo, find_in_photos
 from patchproof.evidence.batch import PhotoItem, measure_all
 from patchproof.evidence.locate import pinhole_photo
-from patchproof.evidence.measure import MeasuredPhoto
+from patchproof.evidence.measure import UNNAMED_ADVICE, MeasuredPhoto
 from patchproof.evidence.reproject import unmix_markers
 from patchproof.evidence.surface import (
     LEAST_CELLS,
@@ -69,14 +69,20 @@ def calibrate_design(
         raise Refused("a sheet with a design", f"{manifest.sheet_id} without one", "name the printed design's JSON")
     task, read, warnings = replace(task_of(manifest, options, None), ranges=promised_ranges(())), {}, []
     numbered = [(n, path, printable(f"{path.parent.name}/{path.name}")) for n, ps in enumerate(places) for path in ps]
-    items = [PhotoItem(path, file, corners=corners_of_photo(options.corners, file, path)) for _, path, file in numbered]
+    items, unused = [PhotoItem(path, file) for _, path, file in numbered], []
+    if options.corners:
+        sources = [(item.file, item.path) for item in items]
+        corners = find_in_photos("corners", options.corners, corners_of_photo, sources, unused)
+        items = [replace(item, corners=px) for item, px in zip(items, corners, strict=True)]
+        warnings += [f"corners of {name} are left out (it is none of these photographs)" for name in unused]
     with open_workers() as workers:
         measured = measure_all(task, items, None, workers, None, lambda file, pictures: None, advance)
-    for (number, path, file), photo in zip(numbered, measured, strict=True):
+    for (number, path, file), item, photo in zip(numbered, items, measured, strict=True):
         if isinstance(design := _read_cells(task, path, photo), str):
-            warnings.append(f"{file} is left out ({design})")
-        else:
-            read.setdefault(photo.entry.sha256, (file, number, design))
+            unnamed = options.corners and item.corners is None and photo.entry.code == "no_corners"
+            warnings.append(f"{file} is left out ({UNNAMED_ADVICE if unnamed else design})")
+        elif (first := read.setdefault(photo.entry.sha256, found := (file, number, design))) is not found:
+            warnings.append(f"{file} is left out (its bytes are those of {first[0]})")
     if not read:
         got = f"none of {len(items)}"
         raise Refused("photographs that resolve the design's cells", got, f"see the first: {warnings[0]}")

@@ -93,8 +93,8 @@ class Drawn(NamedTuple):
 
 
 def load_boxes(path: str | Path, label: str) -> dict[str, Drawn]:
-    """Load boxes by the photograph's name in the file, and by its last part if that is unique. Boxes are of the
-    category `label`, or of the only one; several in one photograph are refused, and boxes outside of it.
+    """Load boxes by the photograph's name in the file. Boxes are of the category `label`, or of the only one; several
+    in one photograph are refused, and boxes outside of it.
     """
     do = "export it again, one box a photograph"
     coco = validate_model(_Coco, read_json(path, "boxes as COCO JSON", do), str(path))
@@ -120,23 +120,27 @@ def load_boxes(path: str | Path, label: str) -> dict[str, Drawn]:
     _refuse_outside(boxes, str(path))
     if outlines := sum(bool(annotation.segmentation) for annotation in annotations):
         warnings.warn(f"{outlines} outlines (segmentation) in {path} are left aside: boxes count", stacklevel=2)
-    return _with_last_parts(boxes)
+    return boxes
 
 
 def load_corners(path: str | Path) -> dict[str, Drawn]:
-    """Load corners by the photograph's name in the file, and by its last part if that is unique. Refused are other than
-    four points, points that do not run clockwise round a convex shape, a photograph named twice, and none at all.
+    """Load corners by the photograph's name in the file. Refused are other than four points, points that do not run
+    clockwise round a convex shape, a photograph named twice, and none at all.
     """
     corners: dict[str, Drawn] = {}
-    for name, named in _read_csv_rows(path) if Path(path).suffix.lower() == ".csv" else _read_points(path):
-        if name in corners or len(named.numbers) != 8:
-            got = "two rows" if name in corners else f"{len(named.numbers) / 2:g} points"
-            raise Refused(f"four points in each photograph of {path}", f"{got} of {name}", _ORDER)
+    if (kind := Path(path).suffix.lower()) not in (".csv", ".json"):
+        raise Refused(_EXPECTED, f"{path}", "name a file that ends in .csv or .json")
+    for name, named in _read_csv_rows(path) if kind == ".csv" else _read_points(path):
+        if name in corners:
+            raise Refused(f"one row for each photograph in {path}", f"two rows of {name}", "remove one of them")
+        if len(named.numbers) != 8:
+            got = f"{len(named.numbers) / 2:g} points of {name}"
+            raise Refused(f"four points in each photograph of {path}", got, _ORDER)
         refuse_twisted(named, name, path)
         corners[name] = named
     if not corners:
         raise Refused(f"corners of the design in {path}", "none of any photograph", _ORDER)
-    return _with_last_parts(corners)
+    return corners
 
 
 def corners_csv(corners: Mapping[str, np.ndarray]) -> str:
@@ -157,7 +161,9 @@ def _read_csv_rows(path: str | Path) -> Iterator[tuple[str, Drawn]]:
 
 
 def _read_points(path: str | Path) -> Iterator[tuple[str, Drawn]]:
-    coco = validate_model(_CocoPoints, read_json(path, _EXPECTED, _ORDER), str(path))
+    if not isinstance(content := read_json(path, _EXPECTED, _ORDER), dict):
+        raise Refused(_EXPECTED, f"{path} without images and annotations", "export it again")
+    coco = validate_model(_CocoPoints, content, str(path))
     images = _images_by_id(coco.images, path)
     for each in coco.annotations:
         polygons = each.segmentation if isinstance(each.segmentation, tuple) else ()
@@ -174,13 +180,6 @@ def _images_by_id(images: Sequence[CocoImage], path: str | Path) -> dict[int, tu
         (name, count), *_ = Counter(image.file_name for image in images).most_common()
         raise Refused(f"each image once in {path}", f"{name} {count} times, or one id twice", "remove the others")
     return found
-
-
-def _with_last_parts(drawn: dict[str, Drawn]) -> dict[str, Drawn]:
-    """Add the last part of each photograph's name where that is unique."""
-    last_parts = {name: PurePosixPath(name).name for name in drawn}
-    uses = Counter(last_parts.values())
-    return {last_parts[name]: each for name, each in drawn.items() if uses[last_parts[name]] == 1} | drawn
 
 
 def _refuse_outside(boxes: Mapping[str, Drawn], source: str) -> None:
@@ -218,20 +217,50 @@ def find_in_photos(
     drawn: Mapping[str, Drawn],
     of_photo: Callable[[Mapping[str, Drawn], str, Path], Found | None],
     photos: Iterable[tuple[str, Path]],
+    unused: list[str],
 ) -> list[Found | None]:
-    """Apply `of_photo` to photographs (name, path); refused if nothing was drawn in any of them."""
-    found = [of_photo(drawn, name, path) for name, path in photos]
+    """Apply `of_photo` to photographs (name, path); refused if nothing was drawn in any of them. `unused` gets the
+    file's names of no photograph.
+    """
+    photos = list(photos)
+    rows = _rows_of(drawn, [name for name, _ in photos])
+    named = [{} if row is None else {name: drawn[row]} for row, (name, _) in zip(rows, photos, strict=True)]
+    found = [of_photo(each, *photo) for each, photo in zip(named, photos, strict=True)]
     if not any(each is not None for each in found):
         do = "name the files in it as the photographs"
         raise Refused(f"{kind} of these photographs", f"{kind} in {summarize_names(list(drawn))}", do)
+    unused += sorted(drawn.keys() - set(rows))
     return found
 
 
-def box_of_photo(boxes: Mapping[str, Drawn], name: str, path: Path) -> BoxEdges | None:
-    """Find the box of the photograph at `path` by its name, or else by the last part of it, in shares of the upright
-    photograph's sides; None if there is none, or the file cannot be read. Refused if drawn in one of another shape.
+def _rows_of(drawn: Mapping[str, Drawn], photos: Sequence[str]) -> list[str | None]:
+    """For each photograph the file's name of it: its own, or else one that ends like it, folders included where both
+    have them. Refused if two names mean one photograph, or two photographs have one name.
     """
-    drawn = boxes.get(name, boxes.get(PurePosixPath(name).name))
+    by_last_part: dict[str, list[str]] = {}
+    for name in sorted(drawn.keys() - set(photos)):
+        by_last_part.setdefault(PurePosixPath(name).name, []).append(name)
+    rows, uses = list[str | None](), dict[str, str]()
+    for photo in photos:
+        near = [n for n in by_last_part.get(PurePosixPath(photo).name, ()) if _ends_alike(n, photo)]
+        near = [photo] if photo in drawn else near
+        if len(near) > 1 or (near and uses.setdefault(near[0], photo) != photo):
+            got = f"{near[0]} and {near[1]}" if len(near) > 1 else f"{near[0]} for {uses[near[0]]}, too,"
+            raise Refused("one row for each photograph", f"{got} for {photo}", "write folder and file in each row")
+        rows.append(near[0] if near else None)
+    return rows
+
+
+def _ends_alike(name: str, other: str) -> bool:
+    one, two = name.split("/")[::-1], other.split("/")[::-1]
+    return all(a == b for a, b in zip(one, two, strict=False))
+
+
+def box_of_photo(boxes: Mapping[str, Drawn], name: str, path: Path) -> BoxEdges | None:
+    """Find the box of the photograph at `path` by its name, in shares of the upright photograph's sides; None if there
+    is none, or the file cannot be read. Refused if drawn in one of another shape.
+    """
+    drawn = boxes.get(name)
     if drawn is None or drawn.size_px is None or (sizes := _sizes_of(path)) is None:
         return None
     upright_px, stored_px, orientation = sizes
@@ -247,10 +276,10 @@ def box_of_photo(boxes: Mapping[str, Drawn], name: str, path: Path) -> BoxEdges 
 
 
 def corners_of_photo(corners: Mapping[str, Drawn], name: str, path: Path) -> DesignCorners | None:
-    """Find the corners in the photograph at `path` by its name, or else by the last part of it; None if there are none.
-    Refused if they were named in a picture of another shape.
+    """Find the corners in the photograph at `path` by its name; None if there are none. Refused if they were named in a
+    picture of another shape.
     """
-    named = corners.get(name, corners.get(PurePosixPath(name).name))
+    named = corners.get(name)
     if named is None:
         return None
     px = np.reshape(named.numbers, (4, 2))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -28,9 +28,18 @@ from patchproof.evidence.batch import MAX_PICTURED_PHOTOS, Journal, PhotoItem, m
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.grouping import COPY_CODE, Grouping, control_keys, group_sessions, merge_folders, reject_copies
 from patchproof.evidence.ledger import estimate_effect, ledger_of
-from patchproof.evidence.measure import UNLOCATED_CODES, MeasuredPhoto
+from patchproof.evidence.measure import UNLOCATED_CODES, UNNAMED_ADVICE, MeasuredPhoto, ruler_scale
 from patchproof.evidence.reproject import PhotoSquare, read_print
-from patchproof.evidence.results import EffectEstimate, Ledger, ModelRate, PhotoEntry, Report, SessionCount, Summary
+from patchproof.evidence.results import (
+    EffectEstimate,
+    Ledger,
+    ModelRate,
+    PhotoEntry,
+    Report,
+    Scale,
+    SessionCount,
+    Summary,
+)
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import MOST_PHOTOS, PLANNED_LOOK, Look, Verdict
 from patchproof.photo.read import list_images, list_skipped_files, subfolders, summarize_said
@@ -57,6 +66,7 @@ def gather_evidence(
     `promised`, `delta_e00` of a measured one) of the first `batch.MAX_PICTURED_PHOTOS` photographs when each is
     measured; `advance` is called with (done, total).
     """
+    printed = None if options.ruler_mm is None else ruler_scale(options.ruler_mm, manifest.ruler_mm)
     controls_folder = None if options.controls is None else Path(options.controls)
     grouping = group_sessions(photos, controls_folder)
     by_control, paths = _list_controls(controls_folder, grouping.names), grouping.paths
@@ -70,13 +80,12 @@ def gather_evidence(
 
         sources = [(item.name, item.path) for item in items]
         if options.boxes:
-            boxes = find_in_photos("boxes", options.boxes, box_of_photo, sources)
+            boxes = find_in_photos("boxes", options.boxes, box_of_photo, sources, [])
             items = [replace(item, box=box) for item, box in zip(items, boxes, strict=True)]
         if options.corners:
-            corners = find_in_photos("corners", options.corners, corners_of_photo, sources[:count])
+            corners = find_in_photos("corners", options.corners, corners_of_photo, sources[:count], unused := [])
             items[:count] = [replace(item, corners=px) for item, px in zip(items[:count], corners, strict=True)]
-            known = {name for file, path in sources[:count] for name in (file, path.name)}
-            if unused := [name for name in options.corners if PurePosixPath(name).name not in known]:
+            if unused:
                 left_out.append(f"corners of {len(unused)} other photographs ({summarize_names(unused)})")
     # workers first: a cluster that is not there leaves no journal
     with open_workers(compute.jobs, compute.cluster) as workers, ExitStack() as stack:
@@ -85,10 +94,9 @@ def gather_evidence(
             stack.callback(open_journal.close)
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
         if options.corners and not options.find:
-            advice = "--corners FILE does not name this photograph: add it there, or add --find"
             for number, (item, result) in enumerate(zip(items, results, strict=True)):
                 if item.corners is None and result.entry.code == "no_corners":
-                    results[number] = replace(result, entry=result.entry.changed(remark={"advice": advice}))
+                    results[number] = replace(result, entry=result.entry.changed(remark={"advice": UNNAMED_ADVICE}))
         grouping = merge_folders(grouping, results[:count])
         patch_photos = reject_copies(results[:count], grouping.merged, task.surface.rect_mm)
         squares: list[PhotoSquare | None] = []
@@ -122,7 +130,7 @@ def gather_evidence(
         if entry.status == "rejected" and entry.remark is not None:
             left_out.append(f"{file} does not count: {entry.remark.advice}")
     look = look_at([photo.entry for photo in patch_photos])
-    report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, options.ruler_mm, look, estimate)
+    report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, printed, look, estimate)
     missing = {}
     if options.scan_dpi and not any(photo.entry.scale for photo in patch_photos):
         missing["the print's scale"] = f"no photograph is a flat scan at {options.scan_dpi:g} dpi"
@@ -171,12 +179,12 @@ def report_of(
     grouping: Grouping,
     controls: Mapping[str, Sequence[MeasuredPhoto]],
     ledger: Ledger | None = None,
-    ruler_mm: tuple[float, float] | None = None,
+    printed: Scale | None = None,
     look: Look | None = PLANNED_LOOK,
     estimate: EffectEstimate | None = None,
 ) -> Report:
     """Sum up all photographs; with a promise and `judges` also verdict, rates and whether the patch helps.
-    Without a `look` the photographs were watched while they were taken.
+    Without a `look` the photographs were watched while they were taken. `printed` is the print's scale by its rulers.
     """
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     judgment = Verdict("cannot_tell", None, "The sheet promises nothing.")
@@ -221,9 +229,8 @@ def report_of(
         draft_views=manifest.promise.n if manifest.promise is not None and manifest.promise.draft else 0,
         models=rates,
     )
-    if ruler_mm is not None:
-        x, y = np.divide(ruler_mm, manifest.ruler_mm).tolist()
-        entries = [entry if entry.scale else entry.changed(scale={"scale_x": x, "scale_y": y}) for entry in entries]
+    if printed is not None:
+        entries = [entry if entry.scale else entry.changed(scale=printed) for entry in entries]
     return Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary, controls=tuple(comparisons))
 
 

@@ -7,12 +7,14 @@ identified but geometry or color cannot be trusted, it is `judged`: recognition 
 views fail first and leaving them out would raise the rate.
 """
 
+import warnings
 from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 
 from patchproof.base.color import photo_codes_from_srgb, srgb_from_linear
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
 from patchproof.evidence.appearance import MOST_CLIPPED, MOST_NOISE, DesignMatch, appearance
 from patchproof.evidence.locate import MOST_SHIFT, PinholePhoto, camera_pose, geometry_of, locate_sheet, object_box
@@ -62,6 +64,7 @@ _OTHER_DPI_ADVICE = (
     "give --scan-dpi the scan's own, the same in both directions"
 )
 _NO_CORNERS_ADVICE = "this print has no markers, and nothing says where it is: add --find or --corners FILE"
+UNNAMED_ADVICE = "--corners FILE does not name this photograph: add it there, or add --find"
 _PLAIN_ADVICE = "without markers a design without structure cannot be told from another one: print it with markers"
 UNLOCATED_CODES = ("too_few_markers", "no_corners")
 _NOISY_ADVICE = "too dark or noisy to compare colors; the rest counts: use more light, or come closer"
@@ -279,6 +282,19 @@ def _scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Sc
     askew_deg = abs((np.degrees(np.arctan2(*(right - left))) + 45) % 90 - 45)
     possible = askew_deg < _MOST_ASKEW_DEG or _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1]
     return scale if perspective < _MOST_PERSPECTIVE and possible else None
+
+
+def ruler_scale(measured_mm: tuple[float, float], printed_mm: tuple[float, float]) -> Scale:
+    """The print's scale by its rulers as somebody measured them; refused if no print of this page has it."""
+    x, y = (measured / printed for measured, printed in zip(measured_mm, printed_mm, strict=True))
+    scale = Scale(scale_x=x, scale_y=y)
+    if not _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1]:
+        expected = "rulers of about {:g} and {:g} mm, as printed".format(*printed_mm)
+        raise Refused(expected, "{:g} and {:g} mm".format(*measured_mm), "measure both of them in millimeters")
+    if abs(_worst(scale) - 1) > MOST_SCALE_ERROR:
+        said = f"by its rulers the print has {x:.3f} × {y:.3f} of its size, and the promise is of the full size"
+        warnings.warn(f'{said}: print again at 100 %, "actual size"', stacklevel=2)
+    return scale
 
 
 def _worst(scale: Scale) -> float:

@@ -165,9 +165,9 @@ def load_checkpoint(out: Path, problem: Problem) -> State:
         with safe_open(path, framework="pt", device=str(problem.device)) as file:
             note = _Note.model_validate_json((file.metadata() or {})["state"])
             if note.sheet_id != problem.scene.sheet_id:
-                do = "resume with the same scene file and seed, or start in another folder"
+                do = "resume with the scene, seed, --steps and --draft that it was begun with, or use another folder"
                 got = f"a checkpoint of sheet {note.sheet_id} in {out}, not {problem.scene.sheet_id}"
-                raise Refused("the checkpoint of this scene and seed", got, do)
+                raise Refused("a checkpoint of the same run", got, do)
             refuse_other_inputs(note.inputs, problem.inputs, out, problem.scene.settings.model_dump())
             design, best = _tensor(file, "design", start_state.design), _tensor(file, "best", start_state.design)
             mean = tuple(_tensor(file, f"mean{n}", level) for n, level in enumerate(start_state.mean))

@@ -20,7 +20,7 @@ from patchproof.base.text import brief
 from patchproof.base.validation import refuse_untrusted
 from patchproof.base.workers import use_threads
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.classifier.labels import find_labels
+from patchproof.classifier.labels import find_labels, refuse_different_entries
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import BatchedNetwork
@@ -140,6 +140,7 @@ def set_problem(
         refuse_untrusted(scene.received, settings.target.models)
     classifiers = tuple(load_classifier(name, scene.base, device).with_least_score(least_score) for name in names)
     indices = tuple(find_labels(c.labels, settings.target.label, settings.target.accept) for c in classifiers)
+    refuse_different_entries([classifier.labels for classifier in classifiers], settings.target.label)
     printer = load_printer(settings.printer.profile, scene.base)
     stage = set_stage(scene, device)
     if loss is not None:

@@ -29,7 +29,7 @@ from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.base.text import short_repr
 from patchproof.base.validation import Side
 from patchproof.channel.printer import identity_printer
-from patchproof.classifier.labels import find_labels
+from patchproof.classifier.labels import find_labels, refuse_different_entries
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.patch import Patch
@@ -158,6 +158,10 @@ def _indices(settings: SceneSettings, labels: Sequence[Sequence[str]]) -> tuple[
         except Refused as refused:
             indices.append(())
             unknown = str(refused)
+    try:
+        refuse_different_entries([each for each, found in zip(labels, indices, strict=True) if found], target.label)
+    except Refused as refused:
+        unknown = str(refused)
     return indices, unknown
 
 
