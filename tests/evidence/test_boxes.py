@@ -41,14 +41,15 @@ def test_boxes_are_found_by_names_that_end_alike(tmp_path):
     path = coco(tmp_path / "c.json", (1, 1, one), (1, 2, [0, 0, 1, 1]), (2, 1, two), (3, 1, three))
     boxes, photo = load_boxes(path, "truck"), tmp_path / "p.png"
     Image.new("RGB", (40, 30)).save(photo)
-    find = lambda *names, unused=[]: find_in_photos(  # noqa: E731 - read after one call
-        "boxes", boxes, box_of_photo, [(name, photo) for name in names], unused
-    )
+
+    def find(*names):
+        return find_in_photos("boxes", dict(boxes), box_of_photo, [(name, photo) for name in names])
+
     *found, elsewhere = find("x/a/p1.jpg", "b/p1.jpg", "p2.jpg", "elsewhere/p2.jpg")
     want = [(1, 2, 11, 22), (0, 0, 9, 9), (3, 4, 8, 10)]
     assert found == [pytest.approx(tuple(np.divide(box, (40, 30, 40, 30)))) for box in want] and elsewhere is None
-    find("b/p2.jpg", unused=(unused := []))
-    assert unused == ["a/p1.jpg", "b/p1.jpg"]
+    find_in_photos("boxes", unused := dict(boxes), box_of_photo, [("b/p2.jpg", photo)])
+    assert sorted(unused) == ["a/p1.jpg", "b/p1.jpg"]
     for names, match in (
         (("p1.jpg",), "got a/p1.jpg and b/p1.jpg for p1.jpg: write folder and file"),
         (("p2.jpg", "x/b/p2.jpg"), "got b/p2.jpg for p2.jpg, too, for x/b/p2.jpg"),
@@ -56,7 +57,7 @@ def test_boxes_are_found_by_names_that_end_alike(tmp_path):
     ):
         with pytest.raises(Refused, match=match):
             find(*names)
-    assert box_of_photo(boxes, "a/p1.jpg", path) is None, "no picture"
+    assert box_of_photo(boxes["a/p1.jpg"], "a/p1.jpg", path) is None, "no picture"
     only = coco(tmp_path / "d.json", (1, 1, one), categories=("thing",), images=("a\\p1.jpg", "p3.jpg"))
     assert load_boxes(only, "truck") == {"a/p1.jpg": ((1, 2, 11, 22), (40, 30))}
 
@@ -198,9 +199,9 @@ def test_what_boxes_declare_is_used_refused_or_said(tmp_path, entry):
         path = coco(tmp_path / "c.json", *((1, 1, box) for box in boxes), **{"images": ONE} | arguments)
         if entry.answer == "refused":
             with pytest.raises(Refused, match=outcome):
-                find_in_photos("boxes", load_boxes(path, "truck"), box_of_photo, [("p1.jpg", tmp_path / "p1.tif")], [])
+                find_in_photos("boxes", load_boxes(path, "truck"), box_of_photo, [("p1.jpg", tmp_path / "p1.tif")])
             continue
         with pytest.warns(UserWarning, match=outcome) if entry.answer == "said" else nullcontext():
             named = [("p1.jpg", tmp_path / "p1.tif")]
-            (found,) = find_in_photos("boxes", load_boxes(path, "truck"), box_of_photo, named, [])
+            (found,) = find_in_photos("boxes", load_boxes(path, "truck"), box_of_photo, named)
         assert found == pytest.approx(tuple(np.divide(UPRIGHT, (40, 30, 40, 30)))), arguments

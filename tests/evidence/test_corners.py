@@ -147,12 +147,12 @@ def test_corners_are_read_from_csv_and_coco(tmp_path):
     ):
         corners = load_corners(path)
         for name in ("s/a.jpg", "a.jpg"):
-            (found, none) = find_in_photos(
-                "corners", corners, corners_of_photo, [(name, picture), ("elsewhere/a.jpg", picture)], []
-            )
+            photos = [(name, picture), ("elsewhere/a.jpg", picture)]
+            (found, none) = find_in_photos("corners", dict(corners), corners_of_photo, photos)
             assert found.px == pytest.approx(CORNERS_PX, abs=precision) and none is None
     with pytest.raises(Refused, match="upright, 480 × 360 pixels, got corners in a picture of 360 × 480"):
-        corners_of_photo(load_corners(coco(tmp_path / "t.json", CORNERS_PX, size=(360, 480))), "s/a.jpg", picture)
+        (named,) = load_corners(coco(tmp_path / "t.json", CORNERS_PX, size=(360, 480))).values()
+        corners_of_photo(named, "s/a.jpg", picture)
 
 
 def test_blanks_round_a_photographs_name_are_none_of_it(tmp_path):

@@ -629,7 +629,7 @@ def corners(place: Place, number: int) -> Use:
     def use() -> None:
         named = load_corners(path)
         for name in list(named)[:9]:
-            corners_of_photo(named, name, place.given / name[:200])
+            corners_of_photo(named[name], name, place.given / name[:200])
 
     return use
 

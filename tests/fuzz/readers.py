@@ -439,7 +439,7 @@ def corners(rng: Rng, folder: Path) -> Read:
     def read() -> None:
         named = load_corners(path)
         for name in named:
-            corners_of_photo(named, name, folder / "a.jpg")
+            corners_of_photo(named[name], name, folder / "a.jpg")
 
     return read
 

@@ -58,8 +58,34 @@ def test_scatter_is_what_no_smooth_map_of_colors_explains(folder):
 
 def test_photographs_without_a_row_are_refused(folder):
     (folder / "photographs.csv").write_text("print,place\nA-one,desk\n", encoding="utf-8")
-    with pytest.raises(Refused, match="1 rows, 3 photographs"):
+    with pytest.raises(Refused, match=r"a row for each photograph, got .* with other contents \(IndexError\)"):
         twins.load_cells(folder / "cells.npz")
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"code": np.tile(CODES, (3, 1)) / 255},  # codes as shares
+        {"light": np.full((3 * len(CODES), 3), np.nan)},
+        {"light": np.full((3 * len(CODES), 3), 255.0)},
+        {"light": np.zeros((3 * len(CODES), 2))},
+        {"photo": np.zeros(7, np.uint8)},
+        {"photo": None},
+    ],
+)
+def test_arrays_that_are_no_cells_are_refused_before_any_work(folder, broken):
+    cells = dict(np.load(folder / "cells.npz")) | broken
+    np.savez(folder / "cells.npz", **{name: array for name, array in cells.items() if array is not None})
+    with pytest.raises(Refused, match=r"cells\.npz of photo .* with other contents"):
+        run_study("real-prints", folder / "s.toml", folder / "out")
+    assert not (folder / "out").exists()
+
+
+def test_rows_of_photographs_without_cells_are_left_out(folder):
+    cells = dict(np.load(folder / "cells.npz"))
+    one = cells["photo"] == 1
+    np.savez(folder / "cells.npz", **{name: array[one] for name, array in cells.items()})
+    assert twins.load_cells(folder / "cells.npz").places == ("A window",)
 
 
 def test_a_twin_shows_the_colors_of_its_photograph():

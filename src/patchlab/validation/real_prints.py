@@ -88,8 +88,8 @@ class RealPrintsSettings(GridSettings):
 
 def cells(settings: RealPrintsSettings, base: Path) -> list[Cell]:
     """A cell for the colors, and one for each scene and network."""
-    pairs = grid_cells(settings, base) if settings.scenes else []
-    return [Cell("colors", {"cells": expand_path(settings.cells, base)}), *pairs]
+    load_cells(Path(path := expand_path(settings.cells, base)))  # refused before any work
+    return [Cell("colors", {"cells": path}), *(grid_cells(settings, base) if settings.scenes else [])]
 
 
 def run(settings: RealPrintsSettings, base: Path, cell: Cell) -> dict[str, Any]:

@@ -7,6 +7,7 @@ and by photograph a `Twin`: a cubic from sRGB sent to sRGB seen through all its 
 from __future__ import annotations
 
 import csv
+import io
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
@@ -41,16 +42,22 @@ class Cells:
 
 def load_cells(path: Path) -> Cells:
     """Read cells of known color and, beside them, `photographs.csv` with the columns print and place."""
-    table = path.with_name("photographs.csv")
+    expected = "cells.npz of photo (N), code (uint8 N×3) and light (N×3, 0 to 4), and a row for each photograph"
+    stored, table = io.BytesIO(read_file(path, expected)), path.with_name("photographs.csv")
     rows = list(csv.DictReader(read_file(table, "photographs of known colors").decode("utf-8-sig").splitlines()))
-    with np.load(path, allow_pickle=False) as file:
-        code, light, photo = file["code"], file["light"].astype(float), file["photo"].astype(int)
-    if photo.max() >= len(rows):
-        got = f"{len(rows)} rows, {photo.max() + 1} photographs"
-        raise Refused(f"a row for each photograph in {table}", got, "add rows")
-    prints = tuple(row["print"] for row in rows)
-    # a place of one maker's prints: another's has another phone
-    places = tuple(f"{row['print'][:1]} {row['place']}" for row in rows)
+    try:
+        with np.load(stored, allow_pickle=False) as file:
+            code, light, photo = file["code"], file["light"].astype(float), file["photo"]
+        indices, photo = np.unique(photo, return_inverse=True)  # without rows of photographs that have no cell
+        # a place of one maker's prints: another's has another phone
+        named = [(row["print"], f"{row['print'][:1]} {row['place']}") for row in (rows[i] for i in indices)]
+        prints, places = zip(*named, strict=True)
+        is_light = 0 <= light.min() <= light.max() <= 4
+        if not (is_light and code.dtype == np.uint8 and code.shape == light.shape == (len(photo), 3)):
+            raise ValueError("other arrays")
+    except Exception as error:  # NumPy, zip and deflate fail in many ways
+        got = f"{path} or {table.name} with other contents ({type(error).__name__})"
+        raise Refused(expected, got, "write them as patchproof's own are") from error
     return Cells(KnownColors(code, np.clip(light, 0, 1), photo), places, prints)
 
 

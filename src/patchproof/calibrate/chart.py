@@ -33,7 +33,7 @@ from patchproof.photo.known_page import find_sheet
 from patchproof.photo.limits import run_limited
 from patchproof.photo.paper_light import paper_light, quadratic_terms
 from patchproof.photo.quality import CLIPPED_CODE, blur_px
-from patchproof.photo.read import Photo, list_images, read_photo, summarize_said
+from patchproof.photo.read import Photo, list_images, read_photo, subfolders, summarize_said
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.rejection import MIRRORED_ADVICE, PhotoRejected
 from patchproof.sheets.manifest import Manifest
@@ -118,7 +118,8 @@ def prints_of(paths: Sequence[Path]) -> list[list[Path]]:
     for folder in (path for path in paths if is_folder(path)):
         prints.append(list_images(folder))
         if not prints[-1]:
-            raise Refused("a folder with photographs of one print", f"none in {folder}", "name the photographs")
+            do = "name its folders, one for each place or print" if subfolders(folder) else "name the photographs"
+            raise Refused("a folder with photographs of one print", f"none in {folder} itself", do)
     for path in singles:
         if not is_file(path):
             raise Refused("a photograph of the chart", f"no file at {path}", "check the path")

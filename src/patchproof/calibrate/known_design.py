@@ -69,10 +69,10 @@ def calibrate_design(
         raise Refused("a sheet with a design", f"{manifest.sheet_id} without one", "name the printed design's JSON")
     task, read, warnings = replace(task_of(manifest, options, None), ranges=promised_ranges(())), {}, []
     numbered = [(n, path, printable(f"{path.parent.name}/{path.name}")) for n, ps in enumerate(places) for path in ps]
-    items, unused = [PhotoItem(path, file) for _, path, file in numbered], []
+    items = [PhotoItem(path, file) for _, path, file in numbered]
     if options.corners:
         sources = [(item.file, item.path) for item in items]
-        corners = find_in_photos("corners", options.corners, corners_of_photo, sources, unused)
+        corners = find_in_photos("corners", unused := dict(options.corners), corners_of_photo, sources)
         items = [replace(item, corners=px) for item, px in zip(items, corners, strict=True)]
         warnings += [f"corners of {name} are left out (it is none of these photographs)" for name in unused]
     with open_workers() as workers:

@@ -13,7 +13,7 @@ out on purpose: points in pictures as stored, which EXIF turns; corners that the
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, TypeVar
 
@@ -131,11 +131,9 @@ def load_corners(path: str | Path) -> dict[str, Drawn]:
     if (kind := Path(path).suffix.lower()) not in (".csv", ".json"):
         raise Refused(_EXPECTED, f"{path}", "name a file that ends in .csv or .json")
     for name, named in _read_csv_rows(path) if kind == ".csv" else _read_points(path):
-        if name in corners:
-            raise Refused(f"one row for each photograph in {path}", f"two rows of {name}", "remove one of them")
-        if len(named.numbers) != 8:
-            got = f"{len(named.numbers) / 2:g} points of {name}"
-            raise Refused(f"four points in each photograph of {path}", got, _ORDER)
+        if name in corners or len(named.numbers) != 8:
+            got, do = ("two rows", "remove one") if name in corners else (f"{len(named.numbers) / 2:g} points", _ORDER)
+            raise Refused(f"four points in each photograph of {path}", f"{got} of {name}", do)
         refuse_twisted(named, name, path)
         corners[name] = named
     if not corners:
@@ -214,54 +212,43 @@ def refuse_twisted(named: Drawn, name: str, path: str | Path) -> None:
 
 def find_in_photos(
     kind: str,
-    drawn: Mapping[str, Drawn],
-    of_photo: Callable[[Mapping[str, Drawn], str, Path], Found | None],
-    photos: Iterable[tuple[str, Path]],
-    unused: list[str],
+    drawn: dict[str, Drawn],
+    of_photo: Callable[[Drawn, str, Path], Found | None],
+    photos: Sequence[tuple[str, Path]],
 ) -> list[Found | None]:
-    """Apply `of_photo` to photographs (name, path); refused if nothing was drawn in any of them. `unused` gets the
-    file's names of no photograph.
-    """
-    photos = list(photos)
-    rows = _rows_of(drawn, [name for name, _ in photos])
-    named = [{} if row is None else {name: drawn[row]} for row, (name, _) in zip(rows, photos, strict=True)]
-    found = [of_photo(each, *photo) for each, photo in zip(named, photos, strict=True)]
-    if not any(each is not None for each in found):
-        do = "name the files in it as the photographs"
-        raise Refused(f"{kind} of these photographs", f"{kind} in {summarize_names(list(drawn))}", do)
-    unused += sorted(drawn.keys() - set(rows))
-    return found
-
-
-def _rows_of(drawn: Mapping[str, Drawn], photos: Sequence[str]) -> list[str | None]:
-    """For each photograph the file's name of it: its own, or else one that ends like it, folders included where both
-    have them. Refused if two names mean one photograph, or two photographs have one name.
+    """Apply `of_photo` to what was drawn in photographs (name, path), and remove that from `drawn`. What is drawn in a
+    photograph has its name, or one that ends like it, folders included where both have them. Refused if two names mean
+    one photograph, or one means two, and if nothing of a `kind` ("": it may lack) was drawn in any.
     """
     by_last_part: dict[str, list[str]] = {}
-    for name in sorted(drawn.keys() - set(photos)):
+    for name in sorted(drawn.keys() - {name for name, _ in photos}):
         by_last_part.setdefault(PurePosixPath(name).name, []).append(name)
-    rows, uses = list[str | None](), dict[str, str]()
-    for photo in photos:
-        near = [n for n in by_last_part.get(PurePosixPath(photo).name, ()) if _ends_alike(n, photo)]
-        near = [photo] if photo in drawn else near
+    found, uses = list[Found | None](), dict[str, str]()
+    for photo, path in photos:
+        alike = [each for each in by_last_part.get(PurePosixPath(photo).name, ()) if _ends_alike(each, photo)]
+        near = [photo] if photo in drawn else alike
         if len(near) > 1 or (near and uses.setdefault(near[0], photo) != photo):
             got = f"{near[0]} and {near[1]}" if len(near) > 1 else f"{near[0]} for {uses[near[0]]}, too,"
             raise Refused("one row for each photograph", f"{got} for {photo}", "write folder and file in each row")
-        rows.append(near[0] if near else None)
-    return rows
+        found.append(of_photo(drawn[near[0]], photo, path) if near else None)
+    if kind and not any(each is not None for each in found):
+        do = "name the files in it as the photographs"
+        raise Refused(f"{kind} of these photographs", f"{kind} in {summarize_names(list(drawn))}", do)
+    for name in uses:
+        del drawn[name]
+    return found
 
 
 def _ends_alike(name: str, other: str) -> bool:
-    one, two = name.split("/")[::-1], other.split("/")[::-1]
-    return all(a == b for a, b in zip(one, two, strict=False))
+    pairs = zip(name.split("/")[::-1], other.split("/")[::-1], strict=False)
+    return all(a == b for a, b in pairs)
 
 
-def box_of_photo(boxes: Mapping[str, Drawn], name: str, path: Path) -> BoxEdges | None:
-    """Find the box of the photograph at `path` by its name, in shares of the upright photograph's sides; None if there
-    is none, or the file cannot be read. Refused if drawn in one of another shape.
+def box_of_photo(drawn: Drawn, name: str, path: Path) -> BoxEdges | None:
+    """A box in the photograph `name` at `path`, in shares of the upright photograph's sides; None if the file cannot be
+    read. Refused if drawn in a picture of another shape.
     """
-    drawn = boxes.get(name)
-    if drawn is None or drawn.size_px is None or (sizes := _sizes_of(path)) is None:
+    if drawn.size_px is None or (sizes := _sizes_of(path)) is None:
         return None
     upright_px, stored_px, orientation = sizes
     x, y = (np.clip(np.divide(drawn.numbers[axis::2], drawn.size_px[axis]), 0, 1) for axis in (0, 1))
@@ -275,13 +262,10 @@ def box_of_photo(boxes: Mapping[str, Drawn], name: str, path: Path) -> BoxEdges 
     return float(x[0]), float(y[0]), float(x[1]), float(y[1])
 
 
-def corners_of_photo(corners: Mapping[str, Drawn], name: str, path: Path) -> DesignCorners | None:
-    """Find the corners in the photograph at `path` by its name; None if there are none. Refused if they were named in a
+def corners_of_photo(named: Drawn, name: str, path: Path) -> DesignCorners | None:
+    """Corners in the photograph `name` at `path`; None if the file cannot be read. Refused if they were named in a
     picture of another shape.
     """
-    named = corners.get(name)
-    if named is None:
-        return None
     px = np.reshape(named.numbers, (4, 2))
     if named.size_px is not None:
         if (sizes := _sizes_of(path)) is None:

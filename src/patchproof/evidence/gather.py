@@ -8,7 +8,7 @@ journal, finished photographs survive a kill.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -80,19 +80,19 @@ def gather_evidence(
 
         sources = [(item.name, item.path) for item in items]
         if options.boxes:
-            boxes = find_in_photos("boxes", options.boxes, box_of_photo, sources, [])
+            boxes = find_in_photos("boxes", drawn := dict(options.boxes), box_of_photo, sources[:count])
+            boxes += find_in_photos("", drawn, box_of_photo, sources[count:])
             items = [replace(item, box=box) for item, box in zip(items, boxes, strict=True)]
         if options.corners:
-            corners = find_in_photos("corners", options.corners, corners_of_photo, sources[:count], unused := [])
+            corners = find_in_photos("corners", unused := dict(options.corners), corners_of_photo, sources[:count])
             items[:count] = [replace(item, corners=px) for item, px in zip(items[:count], corners, strict=True)]
             if unused:
-                left_out.append(f"corners of {len(unused)} other photographs ({summarize_names(unused)})")
-    # workers first: a cluster that is not there leaves no journal
-    with open_workers(compute.jobs, compute.cluster) as workers, ExitStack() as stack:
-        open_journal = Journal(journal, settings_key(manifest, options), resume) if journal else None
-        if open_journal is not None:
-            stack.callback(open_journal.close)
-        results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
+                left_out.append(f"corners of {len(unused)} other photographs ({summarize_names([*unused])})")
+    with (
+        open_workers(compute.jobs, compute.cluster) as workers,  # first: no journal if its cluster is not there
+        closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext() as opened,
+    ):
+        results = measure_all(task, items, judges, workers, opened, on_pictures, advance)
         if options.corners and not options.find:
             for number, (item, result) in enumerate(zip(items, results, strict=True)):
                 if item.corners is None and result.entry.code == "no_corners":

@@ -65,6 +65,7 @@ _OTHER_DPI_ADVICE = (
 )
 _NO_CORNERS_ADVICE = "this print has no markers, and nothing says where it is: add --find or --corners FILE"
 UNNAMED_ADVICE = "--corners FILE does not name this photograph: add it there, or add --find"
+_OTHER_CORNERS_ADVICE = "the design does not lie between the corners that were named: name them to a few pixels"
 _PLAIN_ADVICE = "without markers a design without structure cannot be told from another one: print it with markers"
 UNLOCATED_CODES = ("too_few_markers", "no_corners")
 _NOISY_ADVICE = "too dark or noisy to compare colors; the rest counts: use more light, or come closer"
@@ -158,6 +159,8 @@ def measure(
                 raise PhotoRejected("other_design", None, None, _PLAIN_ADVICE)
             trouble = match.trouble_beside(trouble, *found)
     except PhotoRejected as rejection:
+        if corners is not None and corners.located == "named" and rejection.code == "other_design":
+            rejection = PhotoRejected("other_design", rejection.figure, rejection.threshold, _OTHER_CORNERS_ADVICE)
         return MeasuredPhoto(entry(status="rejected", remark=Remark.of(rejection)), False)
     if trouble is not None and trouble.code != "clipped":
         color = None
@@ -289,7 +292,7 @@ def ruler_scale(measured_mm: tuple[float, float], printed_mm: tuple[float, float
     x, y = (measured / printed for measured, printed in zip(measured_mm, printed_mm, strict=True))
     scale = Scale(scale_x=x, scale_y=y)
     if not _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1]:
-        expected = "rulers of about {:g} and {:g} mm, as printed".format(*printed_mm)
+        expected = "lengths of about {:g} and {:g} mm, as printed".format(*printed_mm)
         raise Refused(expected, "{:g} and {:g} mm".format(*measured_mm), "measure both of them in millimeters")
     if abs(_worst(scale) - 1) > MOST_SCALE_ERROR:
         said = f"by its rulers the print has {x:.3f} × {y:.3f} of its size, and the promise is of the full size"

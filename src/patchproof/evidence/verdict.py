@@ -97,10 +97,10 @@ def judge(
     allowed = f"the promise allows for {low} to {high} in {sessions}"
     share = _share_without_markers(judged, without_markers)
     if share > MOST_WITHOUT_MARKERS:
-        found = f"{without_markers} readable photographs show no marker or corners"
-        return Verdict("cannot_tell", (low, high), f"{found} ({share:.0%}, at most 10 % are allowed).")
+        found = f"{without_markers} of {judged + without_markers} readable photographs show no marker or corners"
+        return Verdict("cannot_tell", (low, high), f"{found}; at most a tenth may.")
     if judged < LEAST_JUDGED:
-        return Verdict("cannot_tell", (low, high), f"Only {judged} photographs could be judged; at least 5 are needed.")
+        return Verdict("cannot_tell", (low, high), f"At least 5 judged photographs are needed, here: {judged}.")
     counts = f"{recognized} of {judged} photographs were recognized"
     if goal.sign * (recognized - (low if goal.sign > 0 else high)) < 0:
         return Verdict("broken", (low, high), f"{counts}; {allowed}.")
@@ -178,7 +178,8 @@ def still_needed(
     if verdict != "cannot_tell" and not control:
         return ""
     if _share_without_markers(sum(photos), without_markers) > MOST_WITHOUT_MARKERS:
-        return "Leave out pictures that do not show the piece, and take again those whose markers cannot be read."
+        do = "do what the report says of each, and leave out pictures that do not show the piece"
+        return f"Too many photographs show no markers or corners: {do}."
     again = worth is None or worth.source == "photographed"
     return photos_line(promise, photos, control, verdict == "cannot_tell", again)
 

@@ -113,6 +113,8 @@ def fit_to_piece(pixels: np.ndarray, scene: PieceScene) -> np.ndarray:
 def _shape_advice(width: int, height: int, scene: PieceScene) -> str:
     """Advice on how to give picture and piece the same shape."""
     width_mm, height_mm = scene.piece.size_mm
+    if scene.settings.sheet.template == NO_PAGE:  # it is printed already
+        return f"state its size as it was printed, such as --as-printed {width_mm:g}x{width_mm * height / width:.4g}"
     wide, high = round(height * width_mm / height_mm), round(width * height_mm / width_mm)
     options = [f"{do} it to {way(width, wide)} × {way(height, high)}" for do, way in (("crop", min), ("pad", max))]
     if scene.settings.object.photos is None:  # with photos the piece is as large as the blank

@@ -175,8 +175,8 @@ def imported_lines(imported: Mapping[str, Any]) -> list[str]:
     width, height = imported["picture_px"]
     return [
         f"{imported['file']}: {width} × {height} pixels, printed at {imported['dpi']:.0f} dpi; {imported['printer']} "
-        f"misses its colors by {imported['delta_e00']:.1f} ΔE00 in the mean, {imported['out_of_gamut']:.0%} of them "
-        "visibly",
+        f"misses its colors by {abs(imported['delta_e00']):.1f} ΔE00 in the mean, {imported['out_of_gamut']:.0%} of "
+        "them visibly",
         *(f"  {note}" for note in imported["notes"]),
     ]
 

@@ -100,7 +100,7 @@ class PhotoCollection:
             raise Refused("four corners inside of a photograph", f"{numbers} in {file}"[:160], "load the page again")
         named = annotations.Drawn(tuple(pairs[:4].ravel().tolist()), (int(pairs[-1, 0]), int(pairs[-1, 1])))
         annotations.refuse_twisted(named, file, "the page")
-        corners = annotations.corners_of_photo({file: named}, file, path)
+        corners = annotations.corners_of_photo(named, file, path)
         if self.wants_corners(path) and corners is not None:
             self._corners[file] = np.round(corners.px, 2)
             write_atomically(self._corners_file, annotations.corners_csv(self._corners))

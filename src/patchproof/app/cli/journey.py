@@ -282,7 +282,7 @@ def verify(
     models: Models = None,
     controls: Annotated[Path | None, Option(help="Photographs of a control, one control per folder.")] = None,
     scan_dpi: Annotated[float | None, Option(min=30, max=4800, help="These are scans at this resolution.")] = None,
-    ruler_mm: Annotated[str | None, Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
+    ruler_mm: Annotated[str | None, Option(help="The rulers (without a page: sides) as measured: 97.1x97.3")] = None,
     camera: Annotated[str | None, Option(help="The camera that took them: a camera file or its name.")] = None,
     boxes: Annotated[Path | None, Option(help="The object's boxes in photographs (COCO JSON), for detectors.")] = None,
     corners: Annotated[Path | None, Option(help="CSV or COCO JSON with the design's four corners.")] = None,
