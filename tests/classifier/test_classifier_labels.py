@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from pydantic import ValidationError
 
 from patchproof.base.errors import Refused
-from patchproof.classifier import Classifier, center_square, find_labels
+from patchproof.base.settings import TargetSettings
+from patchproof.classifier import Classifier, center_square, find_labels, load_classifier
+from patchproof.classifier.labels import refuse_different_entries
 
 LABELS = ("jeep, landrover", "crane", "crane", "box truck", "maillot", "maillot, tank suit", "mouse, computer mouse")
 
@@ -87,3 +90,24 @@ def test_logits_are_those_of_the_centered_square():
     photo[:, 0, :, 16:32] = 1  # red in the middle, black beside it
     torch.testing.assert_close(classifier.logits(photo), torch.tensor([[1.0, 0.0, 0.0]]))
     assert classifier.recognized(classifier.logits(photo), (0,)).all()
+
+
+def test_an_index_is_one_thing_in_all_networks():
+    networks = (("cat", "jeep, landrover"), ("dog", "Jeep"), ("cow", "landrover"))
+    refuse_different_entries(networks, 1)
+    refuse_different_entries(networks, "cat")
+    with pytest.raises(Refused, match='got 0, which is "cat" in one of them and "dog" in another: give its name'):
+        refuse_different_entries(networks, 0)
+
+
+def test_true_is_no_label():
+    with pytest.raises(ValidationError, match="label"):
+        TargetSettings(label=True, models=("builtin",))
+
+
+@pytest.mark.parametrize("where", ["", "def factory():\n    "])
+def test_a_factory_that_ends_the_program_is_refused(tmp_path, where):
+    name = f"ends_{len(where)}"
+    (tmp_path / f"{name}.py").write_text(f"{where}raise SystemExit(0)\n")
+    with pytest.raises(Refused, match=r"SystemExit|an import that fails"):
+        load_classifier(f"module:{name}.factory", tmp_path)

@@ -110,7 +110,8 @@ def test_copies_of_one_photograph_prove_nothing_and_are_named(tmp_path):
     for name in ("e.mp4", "f.DNG", "a.mov"):  # the last is the first photograph's second of video
         (photos / name).write_bytes(b"x")
     save(shot(), photos / "x.jpg")
-    (photos / "deep" / "deeper").mkdir(parents=True)
+    (photos / "deep" / "deeper" / "deepest").mkdir(parents=True)
+    shutil.copy(photos / "x.jpg", photos / "deep" / "deeper" / "deepest")
     (photos / "x.jpg").rename(photos / "deep" / "deeper" / "x.jpg")
     controls = tmp_path / "bare"
     controls.mkdir()
@@ -131,7 +132,7 @@ def test_copies_of_one_photograph_prove_nothing_and_are_named(tmp_path):
         "cropped: 1 (Screenshot_1.jpg): it is a crop or a screenshot",
         "take still photographs): e.mp4",
         "save them as JPEG): f.DNG",
-        "one folder for each session): deep/deeper",
+        "one folder for each session): deep/deeper, deep/deeper/deepest",
         "bare/2.png has the bytes of bare/1.png",
     ):
         assert words in lines

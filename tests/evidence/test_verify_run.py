@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from contextlib import nullcontext
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from patchproof.base.intervals import wilson
 from patchproof.base.progress import Compute
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
+from patchproof.evidence import gather
 from patchproof.evidence.appearance import _cross_fitted_cells, fit_cells, match_design
 from patchproof.evidence.classify import judges_of
 from patchproof.evidence.gather import gather_evidence
@@ -466,6 +468,26 @@ def test_the_patch_s_own_photographs_are_no_control(few, tmp_path):
     said = evidence.summary.left_out
     assert "mean/copied.jpg has the bytes of a.JPG, which counts once" in said
     assert any("mean/sent.jpg does not count: it shows the patch, not the control mean" in each for each in said)
+
+
+def test_without_its_workers_no_journal_is_begun(few, tmp_path, monkeypatch):
+    def unreachable(*settings):
+        raise Refused("a scheduler", "none", "start it")
+
+    monkeypatch.setattr(gather, "open_workers", unreachable)
+    options = Options([NET], identity_printer())
+    with pytest.raises(Refused, match="a scheduler"):
+        gather_evidence(few, make_manifest(promise()), options, journal=tmp_path / "out" / "photos.jsonl")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("mm", "scale"), [((100.5, 100), 1.005), ((97, 96.5), 0.97)])
+def test_rulers_tell_the_size_and_only_a_possible_one(few, mm, scale):
+    with pytest.warns(UserWarning, match=r"0\.970 × 0\.965 of its size") if scale < 0.98 else nullcontext():
+        report = verified(few, ruler_mm=mm)
+    assert all(photo.scale.scale_x == pytest.approx(scale) for photo in report.photos)
+    with pytest.raises(Refused, match=r"lengths of about 100 and 100 mm, as printed, got 9\.7 and 9\.7 mm"):
+        verified(few, ruler_mm=(9.7, 9.7))
 
 
 def test_a_control_s_sheet_under_another_control_s_name_does_not_count(few, tmp_path):
