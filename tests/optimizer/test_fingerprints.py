@@ -49,6 +49,8 @@ def made(tmp_path_factory) -> Path:
         shutil.copy(packaged_path("calibration", "printers", f"coated{suffix}"), folder / f"own{suffix}")
     shutil.copy(packaged_path("calibration", "cameras", "phone.json"), folder / "phone.json")
     save(folder, small())
+    text = (folder / "small.json").read_text().replace('"red"', '"red, mug"')  # what the built-in one calls the same
+    (folder / "small.json").write_text(text)
     settings = {
         **{"object__mesh": "box.obj", "object__length_mm": 400, "background__images": "places"},
         **{"printer__profile": "own.npz", "camera__file": "phone.json", "camera__photo_px": [400, 300]},
