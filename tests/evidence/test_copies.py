@@ -49,7 +49,8 @@ def seen(name, azimuth=10.0, distance=550.0, elevation=5.0, roll=0.0, light=0.8,
         ({"roll": 1.0}, {"roll": 1.5}),
         ({"elevation": 6.0}, {"azimuth": -10.0}),  # as much from the other side
         ({"distance": 559.0}, {"distance": 565.0}),
-        ({"light": 0.83}, {"light": 0.85}),
+        ({"light": 0.83}, {"light": 0.85, "aside": 2.0}),
+        ({"light": 0.4}, {"light": 0.4, "aside": 2.0}),  # an edit, and a camera that was held a little elsewhere
         ({"aside": 7.9, "roll": 0.3}, {"aside": 8.1, "roll": 0.3}),  # a hundredth of 800 px
         ({"aside": 40.0, "roll": 0.2}, {"aside": 40.0, "roll": 0.3}),  # a crop, and a camera that was held elsewhere
         ({"aside": 40.0}, {"aside": 40.0, "distance": 553.0}),

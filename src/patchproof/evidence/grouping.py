@@ -9,7 +9,8 @@ decide: another camera, or a pause of half an hour, begins a new session. Withou
 cautious assumption, since photographs of one session count for less. Also: the sessions of controls.
 Copies count once: files with equal bytes, and in a session those in which light and the sheet's place differ by no more
 than between two shots of a hand-held camera: a centimeter in half a meter, a degree or two, an aim that is off by a
-hundredth of the picture, exposures that differ by a fourteenth of a stop. A crop that keeps its pixels is a copy, too.
+hundredth of the picture, exposures that differ by a fourteenth of a stop. A crop that keeps its pixels is a copy, too,
+and so is a picture of other brightness in which the sheet lies where it lay but for noise: an edit, or from a tripod.
 Left out on purpose: dividing folders, which are somebody's word; copies without a readable sheet that differ in bytes.
 """
 
@@ -53,7 +54,8 @@ SHAPE_TOLERANCE = 0.01  # of the design's longer side: offset of its corners abo
 CROP_TOLERANCE = 0.2  # of those of scale and shape, in which a photograph and its crop are equal but for noise
 # Figures of a view: place of the middle and scale in the picture, pixels per mm, shape of four corners, session, tilt,
 # light in three colors. A crop changes the first three.
-_FIGURES, _IN_PICTURE, _OF_CROPS, _ANYWHERE = 17, slice(3), slice(3, 12), slice(4, None)
+_FIGURES, _IN_PICTURE, _OF_CROPS, _ANYWHERE, _IN_LIGHT = 17, slice(3), slice(3, 12), slice(4, 14), slice(14, None)
+_OF_EDITS = slice(12)
 _UNKNOWN = 1e9  # in place of an unknown figure, which is like other unknown ones
 
 
@@ -281,7 +283,7 @@ def reject_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_
         advice = "its bytes are those of {}, which counts once: leave it out"
         if first is None:
             first = first_by_row.get(row)
-            advice = "it shows what {} shows, from there and in its light, and counts once: take another view"
+            advice = "it shows what {} shows, from there, and counts once: take another view"
         if first is None:
             first_by_sha256 |= {} if entry.sha256 is None else {entry.sha256: entry}
             if (index := index_of.get(row)) is not None:
@@ -318,7 +320,8 @@ def _view(photo: MeasuredPhoto, session: int, rect_mm: Rect) -> np.ndarray | Non
 
 
 def _is_repeated(view: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Whether each of the views N×F, alike but for their place in the picture, is this one again or a crop of it."""
+    """Whether each of the views N×F, alike but for light and place in the picture, is this one, cropped or edited."""
     off = np.abs(others - view)
-    moved, crop = off[:, _IN_PICTURE] > 1, off[:, _OF_CROPS] <= CROP_TOLERANCE
-    return np.logical_not(np.any(moved, 1)) | np.all(crop, 1)
+    lit, placed = np.all(off[:, _IN_LIGHT] <= 1, 1), np.logical_not(np.any(off[:, _IN_PICTURE] > 1, 1))
+    crop, edit = (np.all(off[:, figures] <= CROP_TOLERANCE, 1) for figures in (_OF_CROPS, _OF_EDITS))
+    return np.logical_or(np.logical_and(lit, np.logical_or(placed, crop)), edit)
