@@ -232,7 +232,7 @@ def test_a_print_that_exists_is_promised_photographed_and_judged(printed):
     assert [photo.status for photo in report.photos] == ["measured"] * 3 + ["rejected"]
     assert report.photos[3].code == "no_corners" and report.summary.judged == 3
     assert "FILE does not name this photograph: add it there" in report.photos[3].remark.advice
-    assert any("corners of 2 other" in line or "corners of 1 other" in line for line in report.summary.left_out)
+    assert any(line.startswith("corners of 1 other photographs (") for line in report.summary.left_out)
     assert "3 photographs were located by the design alone" in "".join(report.summary.not_measured.values())
     data = json.loads((folder / "report" / "coco.json").read_text())
     assert {a["attributes"]["located"] for a in data["annotations"] if "attributes" in a} == {"corners"}
@@ -260,6 +260,12 @@ def test_what_needs_a_page_is_refused_for_a_print_without_one(printed, tmp_path,
         (["sheet", run.folder, run.folder, "--out", out], 1, "a page for a sheet together, got prints without one"),
         (["reprint", tmp_path / "there.json", "--n", 1, "--out", out], 2, "prints without a page need --run RUN"),
         (["import", picture, scene, "--out", tmp_path / "o", "--as-printed", "120x120mm"], 2, "mm, without the unit"),
+        (["import", picture, scene, "--out", out, "--as-printed", "120x60"], 1, "such as --as-printed 120x120."),
+        (
+            ["verify", folder, "--sheet", folder / "print.json", "--out", out],
+            1,
+            "or --corners FILE for a print without",
+        ),
     ):
         assert command(*words) == code
         assert said in " ".join(capsys.readouterr().err.replace("│", " ").split()), words

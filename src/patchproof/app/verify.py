@@ -109,6 +109,8 @@ def verify(
         ```
     """
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
+    if not (manifest.markers or capture.find or capture.corners):
+        raise Refused("--find or --corners FILE for a print without markers", "neither", "add one of them")
     with lock_folder(out):
         files = {"camera": capture.camera, "boxes": capture.boxes, "corners": capture.corners}
         _check_out(out, resume, overwrite, (photos, sheet, controls, *files.values()))
