@@ -134,7 +134,7 @@ def gather_evidence(
     missing = {}
     if options.scan_dpi and not any(photo.entry.scale for photo in patch_photos):
         missing["the print's scale"] = f"no photograph is a flat scan at {options.scan_dpi:g} dpi"
-    if placed := sum(photo.entry.located not in ("markers", None) for photo in patch_photos):
+    if placed := sum(photo.counted and photo.entry.located not in ("markers", None) for photo in patch_photos):
         missing["bend, and where paper was cut"] = f"{placed} photographs were located by the design alone"
     if judges and task.promised and options.ledger_photos and (ledger is None or estimate is None):
         missing["where the rate was lost, what controls would show"] = "too few photographs can be measured"
