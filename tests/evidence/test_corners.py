@@ -111,6 +111,7 @@ def test_what_the_corners_do_not_show_is_said(photo, wrong):
     entry = entry_of(seen, corners.get(wrong, CORNERS_PX), design.get(wrong), sigma_px)
     code = "no_corners" if wrong == "another corner first" else "other_design"
     assert (entry.status, entry.code) == ("rejected", code) and entry.color is None
+    assert code != "other_design" or "between the corners that were named" in entry.remark.advice
 
 
 def test_without_corners_nothing_says_where_it_is(photo):

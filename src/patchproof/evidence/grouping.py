@@ -55,7 +55,7 @@ CROP_TOLERANCE = 0.2  # of those of scale and shape, in which a photograph and i
 # Figures of a view: place of the middle and scale in the picture, pixels per mm, shape of four corners, session, tilt,
 # light in three colors. A crop changes the first three.
 _FIGURES, _IN_PICTURE, _OF_CROPS, _ANYWHERE, _IN_LIGHT = 17, slice(3), slice(3, 12), slice(4, 14), slice(14, None)
-_OF_EDITS = slice(12)
+_OF_EDITS = np.r_[0:3, 4:12]  # which may have another size, too
 _UNKNOWN = 1e9  # in place of an unknown figure, which is like other unknown ones
 
 

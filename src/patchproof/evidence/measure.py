@@ -159,7 +159,7 @@ def measure(
                 raise PhotoRejected("other_design", None, None, _PLAIN_ADVICE)
             trouble = match.trouble_beside(trouble, *found)
     except PhotoRejected as rejection:
-        if corners is not None and corners.located == "named" and rejection.code == "other_design":
+        if corners is not None and corners.located == "corners" and rejection.code == "other_design":
             rejection = PhotoRejected("other_design", rejection.figure, rejection.threshold, _OTHER_CORNERS_ADVICE)
         return MeasuredPhoto(entry(status="rejected", remark=Remark.of(rejection)), False)
     if trouble is not None and trouble.code != "clipped":

@@ -16,7 +16,7 @@ from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.surface import PromisedColors, Surface, promised_of, surface_of
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import ConditionClaim, Manifest
-from patchproof.sheets.piece import SHEET_KINDS, marker_ids
+from patchproof.sheets.piece import IDS_PER_KIND, SHEET_KINDS, marker_ids
 
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
@@ -133,6 +133,7 @@ def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task
     sizes = tuple(sorted({model.input_px for model in judges.models})) if judges else ()
     camera = options.scan_dpi, options.camera, photo_px and tuple(photo_px)
     find = manifest.design.pixels() if options.find and manifest.design else None
-    ids = {kind: frozenset(marker_ids(manifest.sheet_id, kind, len(surface.piece_ids))) for kind in SHEET_KINDS}
+    most = min(len(surface.piece_ids), IDS_PER_KIND)
+    ids = {kind: frozenset(marker_ids(manifest.sheet_id, kind, most)) for kind in SHEET_KINDS}
     ids["design"] = surface.piece_ids
     return Task(surface, promised_of(manifest, surface, options.printer), ranges, sizes, *camera, find, ids)
