@@ -43,13 +43,13 @@ def test_boxes_are_found_by_names_that_end_alike(tmp_path):
     Image.new("RGB", (40, 30)).save(photo)
 
     def find(*names):
-        return find_in_photos("boxes", dict(boxes), box_of_photo, [(name, photo) for name in names])
+        return find_in_photos("boxes", boxes, box_of_photo, [(name, photo) for name in names])[0]
 
     *found, elsewhere = find("x/a/p1.jpg", "b/p1.jpg", "p2.jpg", "elsewhere/p2.jpg")
     want = [(1, 2, 11, 22), (0, 0, 9, 9), (3, 4, 8, 10)]
     assert found == [pytest.approx(tuple(np.divide(box, (40, 30, 40, 30)))) for box in want] and elsewhere is None
-    find_in_photos("boxes", unused := dict(boxes), box_of_photo, [("b/p2.jpg", photo)])
-    assert sorted(unused) == ["a/p1.jpg", "b/p1.jpg"]
+    _, remaining = find_in_photos("boxes", boxes, box_of_photo, [("b/p2.jpg", photo)])
+    assert sorted(remaining) == ["a/p1.jpg", "b/p1.jpg"]
     for names, match in (
         (("p1.jpg",), "got a/p1.jpg and b/p1.jpg for p1.jpg: write folder and file"),
         (("p2.jpg", "x/b/p2.jpg"), "got b/p2.jpg for p2.jpg, too, for x/b/p2.jpg"),
@@ -203,5 +203,5 @@ def test_what_boxes_declare_is_used_refused_or_said(tmp_path, entry):
             continue
         with pytest.warns(UserWarning, match=outcome) if entry.answer == "said" else nullcontext():
             named = [("p1.jpg", tmp_path / "p1.tif")]
-            (found,) = find_in_photos("boxes", load_boxes(path, "truck"), box_of_photo, named)
+            (found,), _ = find_in_photos("boxes", load_boxes(path, "truck"), box_of_photo, named)
         assert found == pytest.approx(tuple(np.divide(UPRIGHT, (40, 30, 40, 30)))), arguments

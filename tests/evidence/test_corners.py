@@ -149,7 +149,7 @@ def test_corners_are_read_from_csv_and_coco(tmp_path):
         corners = load_corners(path)
         for name in ("s/a.jpg", "a.jpg"):
             photos = [(name, picture), ("elsewhere/a.jpg", picture)]
-            (found, none) = find_in_photos("corners", dict(corners), corners_of_photo, photos)
+            (found, none), _ = find_in_photos("corners", corners, corners_of_photo, photos)
             assert found.px == pytest.approx(CORNERS_PX, abs=precision) and none is None
     with pytest.raises(Refused, match="upright, 480 × 360 pixels, got corners in a picture of 360 × 480"):
         (named,) = load_corners(coco(tmp_path / "t.json", CORNERS_PX, size=(360, 480))).values()

@@ -72,9 +72,9 @@ def calibrate_design(
     items = [PhotoItem(path, file) for _, path, file in numbered]
     if options.corners:
         sources = [(item.file, item.path) for item in items]
-        corners = find_in_photos("corners", unused := dict(options.corners), corners_of_photo, sources)
+        corners, remaining = find_in_photos("corners", options.corners, corners_of_photo, sources)
         items = [replace(item, corners=px) for item, px in zip(items, corners, strict=True)]
-        warnings += [f"corners of {name} are left out (it is none of these photographs)" for name in unused]
+        warnings += [f"corners of {name} are left out (it is none of these photographs)" for name in remaining]
     with open_workers() as workers:
         measured = measure_all(task, items, None, workers, None, lambda file, pictures: None, advance)
     for (number, path, file), item, photo in zip(numbered, items, measured, strict=True):

@@ -212,13 +212,13 @@ def refuse_twisted(named: Drawn, name: str, path: str | Path) -> None:
 
 def find_in_photos(
     kind: str,
-    drawn: dict[str, Drawn],
+    drawn: Mapping[str, Drawn],
     of_photo: Callable[[Drawn, str, Path], Found | None],
     photos: Sequence[tuple[str, Path]],
-) -> list[Found | None]:
-    """Apply `of_photo` to what was drawn in photographs (name, path), and remove that from `drawn`. What is drawn in a
-    photograph has its name, or one that ends like it, folders included where both have them. Refused if two names mean
-    one photograph, or one means two, and if nothing of a `kind` ("": it may lack) was drawn in any.
+) -> tuple[list[Found | None], dict[str, Drawn]]:
+    """Apply `of_photo` to what was drawn in photographs (name, path); return the results, and what is of none of them.
+    What was drawn in a photograph has its name, or one that ends like it, folders included where both have them.
+    Refused if two names mean one photograph, or one means two, or nothing of a `kind` ("": it may lack) was drawn.
     """
     by_last_part: dict[str, list[str]] = {}
     for name in sorted(drawn.keys() - {name for name, _ in photos}):
@@ -234,9 +234,7 @@ def find_in_photos(
     if kind and not any(each is not None for each in found):
         do = "name the files in it as the photographs"
         raise Refused(f"{kind} of these photographs", f"{kind} in {summarize_names(list(drawn))}", do)
-    for name in uses:
-        del drawn[name]
-    return found
+    return found, {name: each for name, each in drawn.items() if name not in uses}
 
 
 def _ends_alike(name: str, other: str) -> bool:
@@ -244,17 +242,17 @@ def _ends_alike(name: str, other: str) -> bool:
     return all(a == b for a, b in pairs)
 
 
-def box_of_photo(drawn: Drawn, name: str, path: Path) -> BoxEdges | None:
+def box_of_photo(box: Drawn, name: str, path: Path) -> BoxEdges | None:
     """A box in the photograph `name` at `path`, in shares of the upright photograph's sides; None if the file cannot be
     read. Refused if drawn in a picture of another shape.
     """
-    if drawn.size_px is None or (sizes := _sizes_of(path)) is None:
+    if box.size_px is None or (sizes := _sizes_of(path)) is None:
         return None
     upright_px, stored_px, orientation = sizes
-    x, y = (np.clip(np.divide(drawn.numbers[axis::2], drawn.size_px[axis]), 0, 1) for axis in (0, 1))
-    if not _is_same_shape(drawn.size_px, upright_px):
-        if not _is_same_shape(drawn.size_px, stored_px):
-            (width, height), (w, h) = upright_px, drawn.size_px
+    x, y = (np.clip(np.divide(box.numbers[axis::2], box.size_px[axis]), 0, 1) for axis in (0, 1))
+    if not _is_same_shape(box.size_px, upright_px):
+        if not _is_same_shape(box.size_px, stored_px):
+            (width, height), (w, h) = upright_px, box.size_px
             expected = f"boxes in {name} of {width} × {height} pixels, or in a copy of all of it"
             raise Refused(expected, f"boxes in a picture of {w} × {h}", "draw them in the photographs themselves")
         x, y = y, x  # as stored; then what turns or mirrors it
@@ -262,19 +260,19 @@ def box_of_photo(drawn: Drawn, name: str, path: Path) -> BoxEdges | None:
     return float(x[0]), float(y[0]), float(x[1]), float(y[1])
 
 
-def corners_of_photo(named: Drawn, name: str, path: Path) -> DesignCorners | None:
+def corners_of_photo(corners: Drawn, name: str, path: Path) -> DesignCorners | None:
     """Corners in the photograph `name` at `path`; None if the file cannot be read. Refused if they were named in a
     picture of another shape.
     """
-    px = np.reshape(named.numbers, (4, 2))
-    if named.size_px is not None:
+    px = np.reshape(corners.numbers, (4, 2))
+    if corners.size_px is not None:
         if (sizes := _sizes_of(path)) is None:
             return None
-        if not _is_same_shape(named.size_px, sizes[0]):
+        if not _is_same_shape(corners.size_px, sizes[0]):
             expected = f"corners in {name} as it is shown upright, {sizes[0][0]} × {sizes[0][1]} pixels"
-            got = f"corners in a picture of {named.size_px[0]} × {named.size_px[1]}"
+            got = f"corners in a picture of {corners.size_px[0]} × {corners.size_px[1]}"
             raise Refused(expected, got, "name them in the photographs themselves, turned as EXIF says")
-        px = px * np.divide(sizes[0], named.size_px)
+        px = px * np.divide(sizes[0], corners.size_px)
     return DesignCorners(px, CORNER_SIGMA_PX)
 
 

@@ -57,8 +57,8 @@ _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its dens
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
-# longer side in which a control is searched for sheets, coarsely, as a full search takes a second where there are none;
-# markers that prove a sheet
+# Longer side of the copy of a control's photograph that is searched for sheets (a full search of one that shows none
+# takes a second), and the markers that prove a sheet.
 _CONTROL_PX, _PROVING_MARKERS = 2400, 2
 _OTHER_SHEET_ADVICE = "it shows the {}, not the control {}: put it where it belongs"
 _CROP_ADVICE = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"

@@ -66,7 +66,7 @@ def gather_evidence(
     `promised`, `delta_e00` of a measured one) of the first `batch.MAX_PICTURED_PHOTOS` photographs when each is
     measured; `advance` is called with (done, total).
     """
-    printed = None if options.ruler_mm is None else ruler_scale(options.ruler_mm, manifest.ruler_mm)
+    print_scale = None if options.ruler_mm is None else ruler_scale(options.ruler_mm, manifest.ruler_mm)
     controls_folder = None if options.controls is None else Path(options.controls)
     grouping = group_sessions(photos, controls_folder)
     by_control, paths = _list_controls(controls_folder, grouping.names), grouping.paths
@@ -80,19 +80,19 @@ def gather_evidence(
 
         sources = [(item.name, item.path) for item in items]
         if options.boxes:
-            boxes = find_in_photos("boxes", drawn := dict(options.boxes), box_of_photo, sources[:count])
-            boxes += find_in_photos("", drawn, box_of_photo, sources[count:])
-            items = [replace(item, box=box) for item, box in zip(items, boxes, strict=True)]
+            boxes, remaining = find_in_photos("boxes", options.boxes, box_of_photo, sources[:count])
+            of_controls, _ = find_in_photos("", remaining, box_of_photo, sources[count:])
+            items = [replace(item, box=box) for item, box in zip(items, boxes + of_controls, strict=True)]
         if options.corners:
-            corners = find_in_photos("corners", unused := dict(options.corners), corners_of_photo, sources[:count])
+            corners, remaining = find_in_photos("corners", options.corners, corners_of_photo, sources[:count])
             items[:count] = [replace(item, corners=px) for item, px in zip(items[:count], corners, strict=True)]
-            if unused:
-                left_out.append(f"corners of {len(unused)} other photographs ({summarize_names([*unused])})")
+            if remaining:
+                left_out.append(f"corners of {len(remaining)} other photographs ({summarize_names([*remaining])})")
     with (
         open_workers(compute.jobs, compute.cluster) as workers,  # first: no journal if its cluster is not there
-        closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext() as opened,
+        closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext() as log,
     ):
-        results = measure_all(task, items, judges, workers, opened, on_pictures, advance)
+        results = measure_all(task, items, judges, workers, log, on_pictures, advance)
         if options.corners and not options.find:
             for number, (item, result) in enumerate(zip(items, results, strict=True)):
                 if item.corners is None and result.entry.code == "no_corners":
@@ -130,7 +130,7 @@ def gather_evidence(
         if entry.status == "rejected" and entry.remark is not None:
             left_out.append(f"{file} does not count: {entry.remark.advice}")
     look = look_at([photo.entry for photo in patch_photos])
-    report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, printed, look, estimate)
+    report = report_of(manifest, judges, patch_photos, grouping, controls, ledger, print_scale, look, estimate)
     missing = {}
     if options.scan_dpi and not any(photo.entry.scale for photo in patch_photos):
         missing["the print's scale"] = f"no photograph is a flat scan at {options.scan_dpi:g} dpi"
@@ -179,12 +179,12 @@ def report_of(
     grouping: Grouping,
     controls: Mapping[str, Sequence[MeasuredPhoto]],
     ledger: Ledger | None = None,
-    printed: Scale | None = None,
+    print_scale: Scale | None = None,
     look: Look | None = PLANNED_LOOK,
     estimate: EffectEstimate | None = None,
 ) -> Report:
     """Sum up all photographs; with a promise and `judges` also verdict, rates and whether the patch helps.
-    Without a `look` the photographs were watched while they were taken. `printed` is the print's scale by its rulers.
+    Without a `look` the photographs were watched while they were taken. `print_scale` is by its rulers.
     """
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     judgment = Verdict("cannot_tell", None, "The sheet promises nothing.")
@@ -229,8 +229,8 @@ def report_of(
         draft_views=manifest.promise.n if manifest.promise is not None and manifest.promise.draft else 0,
         models=rates,
     )
-    if printed is not None:
-        entries = [entry if entry.scale else entry.changed(scale=printed) for entry in entries]
+    if print_scale is not None:
+        entries = [entry if entry.scale else entry.changed(scale=print_scale) for entry in entries]
     return Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary, controls=tuple(comparisons))
 
 

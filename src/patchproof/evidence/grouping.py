@@ -322,6 +322,6 @@ def _view(photo: MeasuredPhoto, session: int, rect_mm: Rect) -> np.ndarray | Non
 def _is_repeated(view: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Whether each of the views N×F, alike but for light and place in the picture, is this one, cropped or edited."""
     off = np.abs(others - view)
-    lit, placed = np.all(off[:, _IN_LIGHT] <= 1, 1), np.logical_not(np.any(off[:, _IN_PICTURE] > 1, 1))
+    same_light, same_place = np.all(off[:, _IN_LIGHT] <= 1, 1), np.logical_not(np.any(off[:, _IN_PICTURE] > 1, 1))
     crop, edit = (np.all(off[:, figures] <= CROP_TOLERANCE, 1) for figures in (_OF_CROPS, _OF_EDITS))
-    return np.logical_or(np.logical_and(lit, np.logical_or(placed, crop)), edit)
+    return np.logical_or(np.logical_and(same_light, np.logical_or(same_place, crop)), edit)
