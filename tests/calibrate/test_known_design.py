@@ -18,6 +18,7 @@ from patchproof.base.color import ciede2000, lab_from_srgb, linear_from_srgb, sr
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.progress import no_advance
+from patchproof.calibrate.chart import prints_of
 from patchproof.calibrate.known_design import COVERED_DELTA_E00, UNTOUCHED_DELTA_E00, calibrate_design
 from patchproof.channel.print_colors import ShownColors
 from patchproof.channel.printer import load_printer, printer_output, vary_print
@@ -126,8 +127,18 @@ def test_a_print_without_markers_is_a_chart_too(tmp_path):
     with pytest.raises(Refused, match=r"got none of 2: .*nothing says where it is: add --find or --corners FILE"):
         calibrated(photos, manifest)
     px = apply_homography(paper.view(15, 10, 430, size_px=SIZE_PX), rect_corners(paper.DESIGN_MM)) + 1
-    corners = {f"{place}/a.png": Drawn(tuple(px.ravel())) for place in PLACES}
+    for place in ("copied", "unnamed"):
+        (tmp_path / place).mkdir()
+        photos.append([tmp_path / place / "a.png"])
+        photos[-1][0].write_bytes(photos[0][0].read_bytes())
+    corners = {f"{place}/a.png": Drawn(tuple(px.ravel())) for place in (*PLACES, "copied", "nowhere")}
     printer, warnings = calibrated(photos, manifest, ("coated",), corners=corners)
+    first = photos[0][0].parent.name
+    assert warnings[:3] == (
+        "corners of nowhere/a.png are left out (it is none of these photographs)",
+        f"copied/a.png is left out (its bytes are those of {first}/a.png)",
+        "unnamed/a.png is left out (--corners FILE does not name this photograph: add it there, or add --find)",
+    )
     error, before = errors(printer, sent_colors(manifest))
     assert error < before / 2 and "photograph a print with markers or with white" in warnings[-1]
 
@@ -141,6 +152,12 @@ def test_photographs_that_do_not_show_paper_between_the_markers_cells_are_refuse
     assert error < before / 2
     with pytest.raises(Refused, match=r"none of 1: see the first: desk/a.png is left out \(1.7 px of a marker's cell"):
         calibrated(take(tmp_path / "far", manifest, 860, ("desk",)), manifest)
+
+
+def test_a_folder_of_places_is_told_from_one_place(printed):
+    _, photos = printed
+    with pytest.raises(Refused, match=r"none in .* itself: name its folders, one for each place or print"):
+        prints_of([photos[0][0].parents[1]])
 
 
 def test_four_colors_are_too_few(tmp_path):

@@ -545,7 +545,7 @@ def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     with pytest.raises(Refused, match="--overwrite"):
         optimize_scene(scene, tmp_path / "run")
-    with pytest.raises(Refused, match="checkpoint of the same run"):
+    with pytest.raises(Refused, match=r"checkpoint of the same run, got .* --steps and --draft that it was begun with"):
         optimize_scene(scene, tmp_path / "run", seed=5, resume=True)
     broken = toml(tmp_path / "broken.toml", target__label="no such label")
     with pytest.raises(Refused, match="no such label"):
