@@ -22,7 +22,6 @@ from patchproof.base.fingerprint import value_sha256
 from patchproof.base.intervals import student_mean, wilson
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import read_toml, validate_model
-from patchproof.optimizer.problem import FIGURE_SAMPLING, FIGURE_SCALE
 from patchproof.optimizer.run import load_run
 from patchproof.scene.scene import load_scene
 
@@ -70,7 +69,7 @@ def test_commands(here, monkeypatch, capsys):
     assert load_run("run").promise.controls["bare"].rate < 0.6
     said = r"`helps: (\+[\d.]+ points \[\+[\d.]+, \+[\d.]+\]) beside its best control \((\w+)\)"
     gain = re.search(said, README.read_text("utf-8"))
-    (row,) = (line for line in NOTEBOOK.read_text("utf-8").splitlines() if line.startswith("| README's own scene"))
+    (row,) = (line for line in NOTEBOOK.read_text("utf-8").splitlines() if line.startswith("| README's scene"))
     assert gain and f"{gain[2]} " in row and gain[1] in row
 
 
@@ -304,19 +303,11 @@ def test_finds_of_prints_without_markers_are_the_stored_ones():
     assert f"In {len(real)} photographs of other things" in words(NOTEBOOK) and f"[0, {bound}]" in words(NOTEBOOK)
 
 
-def test_what_jagged_outlines_cost_is_the_stored_figure():
-    told = []
-    for row in rows_of("views/edges.csv"):
-        told.append("{:.3f} [{:.3f}, {:.3f}]".format(*(float(row[f"jagged_{end}"]) for end in ("off", "low", "high"))))
-        assert abs(float(row["smooth_off"])) < 0.0065
-    said = "SUV {}, pickup {}, traffic light {}, letter box {}, mug {}, carton {}"
-    assert said.format(*told) in words(NOTEBOOK)
-
-
 def test_figures_of_imported_designs_are_the_stored_ones():
     tables = stored("promises/imported.json")["tables"]
     (held, rendered), rows = (tables[name]["rows"][-1][1] for name in ("held", "rendered")), tables["elsewhere"]["rows"]
-    row = next(line for line in words(NOTEBOOK).split("| ") if line.startswith("promised 75 and 54 %"))
+    row = words(NOTEBOOK).partition("| promised 75 and 54 %")
+    row = (row[1] + row[2])[2:].partition("11-22")[0]
     for share in (held, rendered):
         count = f"{round(share['value'] * share['n'])} of {share['n']}"
         interval = f"({share['value']:.0%} [{100 * share['low']:.0f}, {100 * share['high']:.0f}])".replace("%", " %")
@@ -375,6 +366,25 @@ def test_figures_of_a_step_are_the_stored_ones():
         assert f"| {name} | {' | '.join(ratios + parts)} |" in words(NOTEBOOK)
 
 
+def test_predicted_speeds_are_the_stored_ones():
+    times: dict[tuple[str, str], list[str]] = {}
+    for row in rows_of("speed/cores.csv"):
+        if row["cores"] != "1":
+            times.setdefault((row["views"], row["batch"]), []).append(f"{float(row['times_as_fast']):.2f}")
+    rows = [f"| {views}, {batch} | {' | '.join(each)} |" for (views, batch), each in times.items()]
+    assert sum(row in words(NOTEBOOK) for row in rows) == 5  # those of batches that are shared among more cores
+
+
+def test_medians_of_printed_boards_are_the_stored_ones():
+    boards: dict[str, list[float]] = {}
+    for row in rows_of("real/real_boards.csv"):
+        boards.setdefault(row["board"], []).append(float(row["median"]))
+    for name in ("grid", "charuco", "loose"):
+        rms, p95, edge, ours, overshoot = next(each for board, each in boards.items() if name in board)[:5]
+        cells = f"{rms:.1f} / {p95:.0f} | {edge:.2f} / {ours:.2f} | {100 * overshoot:.0f} %"
+        assert f") | {cells} |" in words(NOTEBOOK), name
+
+
 def test_figures_of_windows_are_the_stored_ones():
     rows, told = (
         rows_of("speed/windows.csv"),
@@ -386,83 +396,6 @@ def test_figures_of_windows_are_the_stored_ones():
         for asked, ratio in (("gradients", "ratio"), ("answers", "beside_ratio")):
             ratios = [f"{float(row[ratio]):.2f}" for row in rows[6 * number : 6 * number + 6]]
             assert f"| {name} | {asked} | {' | '.join(ratios)} |" in words(NOTEBOOK)
-
-
-def test_figures_of_half_precision_are_the_stored_ones():
-    rows = rows_of("speed/half.csv")
-    told = dict(zip(("suv", "postbox", "carton", "truck"), ("SUV", "letter box", "carton", "truck"), strict=True))
-    assert [row["scene"] for row in rows[::2]] == [*told] and all(float(row["mean"]) < 0 for row in rows)
-    for pair in zip(rows[::2], rows[1::2], strict=True):
-        cells = [told[pair[0]["scene"]], f"{float(pair[0]['share']):.2f}"]
-        for row in pair:
-            rates = (f"{100 * float(row[name]):.1f}" for name in ("rate", "half_rate"))
-            cells += [f"{float(row['mean']):.3f}, {float(row['rms']):.3f}", row["other"], " and ".join(rates)]
-        assert f"| {' | '.join(cells)} |" in words(NOTEBOOK)
-
-
-def test_figures_of_selections_are_the_stored_ones():
-    rows = rows_of("speed/selections.csv")
-    kept = sum(row["all_best"] == row["half_best"] == "960" for row in rows)
-    assert f"{kept} of {len(rows)} runs of 960 views kept their last design" in words(NOTEBOOK)
-    others = [row for row in rows if row["all_best"] != row["half_best"]]
-    loss = [float(row["half_loss"]) - float(row["all_loss"]) for row in others]
-    points = [100 * (float(row["all_rate"]) - float(row["half_rate"])) for row in others]
-    said = "by {:.2f} and {:.2f} of loss and {:.1f} and {:.1f} points".format(*loss, *points)
-    assert kept + len(others) == len(rows) and said in words(NOTEBOOK)
-
-
-def test_figures_of_poses_that_come_round_are_the_stored_ones():
-    rows = rows_of("speed/poses.csv")
-    assert len(rows) == 18
-
-    def beside_each(name: str, kind: str):
-        values = np.array([[float(row[f"{of}_{kind}"]) for of in (name, "each")] for row in rows])
-        return student_mean(np.diff(np.log(values) if kind == "loss" else values)[:, 0] * -100)
-
-    for name in ("again", "kept"):
-        loss, rate = beside_each(name, "loss"), beside_each(name, "rate")
-        assert (
-            f"{loss.value:.1f} % [{loss.low:.1f}, {loss.high:.1f}] more loss and {rate.value:+.1f} points "
-            f"[{rate.low:.1f}, {rate.high:.1f}]" in words(NOTEBOOK)
-        )
-
-
-def test_figures_of_whole_runs_are_the_stored_ones():
-    for name, told in {
-        "whole": "SUV, MobileNetV2",
-        "truck": "box truck, built-in network",
-        "carton": "carton, SqueezeNet",
-        "postbox": "letter box, MobileNet v1 0.75",
-    }.items():
-        by_commit: dict[str, list[dict[str, str]]] = {}
-        for row in rows_of(f"speed/{name}.csv"):
-            by_commit.setdefault(row["commit"], []).append(row)
-        before, now = by_commit.values()
-        promise, promise_now, whole, whole_now = (
-            np.mean([float(row[part]) for row in some]) for part in ("promise_s", "all_s") for some in (before, now)
-        )
-        times, share = f"{promise / promise_now:.2f}", f"{whole_now / whole:.2f}"
-        rates = [[100 * float(some[0][figure]) for figure in ("rate", "low", "high")] for some in (before, now)]
-        said = ["{:.1f} [{:.0f}, {:.0f}]".format(*rate) for rate in rates]
-        assert max(rate[1] for rate in rates) < min(rate[2] for rate in rates)  # of designs that differ, too
-        figures = [f"{promise:.1f}", f"{promise_now:.1f}", times, f"{whole:.1f}", f"{whole_now:.1f}", share, *said]
-        assert f"| {told} | {len(now)} | {' | '.join(figures)} |" in words(NOTEBOOK)
-
-
-def test_figures_of_large_photographs_are_the_stored_ones():
-    rows = rows_of("speed/photos.csv")
-    before, now = (
-        [row for row in rows if row["commit"] == commit] for commit in dict.fromkeys(r["commit"] for r in rows)
-    )
-    page = words(NOTEBOOK)
-    for some in (now, before):
-        each = [float(row["ms"]) for row in some]
-        rounds = [np.mean([float(row["ms"]) for row in some if row["round"] == number]) for number in "012"]
-        assert "{:.0f}, {:.0f} and {:.0f} ms".format(*rounds) in page and len(each) == 3 * 24
-        assert f"{1000 / np.mean(each):.1f} a second" in page
-    assert f"(median photograph {np.median([float(row['ms']) for row in now]):.0f} ms)" in page
-    for name in ("photo", "status", "code", "markers"):
-        assert [row[name] for row in now] == [row[name] for row in before]
 
 
 def test_figures_of_views_are_the_stored_ones():
@@ -478,25 +411,6 @@ def test_figures_of_views_are_the_stored_ones():
         rates = f"{float(design['views_rate']):.1%} in views, {float(design['photographs_rate']):.1%} in photographs"
         sizes = f"{design['view_px']}, {design['photo_px']}"
         assert f"| {sizes} | {off} | {rates.replace('%', ' %')} |" in page
-
-
-def test_figures_of_fewer_taps_at_a_piece_are_the_stored_ones():
-    rows = [row for row in rows_of("views/taps.csv") if int(row["taps"]) == FIGURE_SAMPLING.piece_taps]
-    assert [row["scene"] for row in rows] == ["suv", "postbox", "carton", "truck"]
-    assert max(abs(float(row["mean"])) for row in rows) < 0.0004 and max(float(row["rms"]) for row in rows) < 0.004
-    for told in ([f"{float(row['mean']):+.4f}" for row in rows], [f"{float(row['rms']):.3f}" for row in rows]):
-        assert f"{', '.join(told[:3])} and {told[3]} in the" in words(NOTEBOOK)
-    assert "{}, {}, {} and {} of them change sides".format(*(row["other"] for row in rows)) in words(NOTEBOOK)
-
-
-def test_looks_of_views_are_the_stored_ones():
-    off, page = {}, words(NOTEBOOK)
-    for row in rows_of("views/looks.csv"):
-        if row["shown"] == "design":
-            off.setdefault((row["times"], row["width"], row["taps"]), []).append(f"{float(row['off']):+.3f}")
-    told = [look for look, each in off.items() if f"| {' | '.join([*look, *each])} |" in page]
-    chosen = str(FIGURE_SCALE), str(FIGURE_SAMPLING.side), str(FIGURE_SAMPLING.taps)
-    assert len(told) == 9 and f"| {' | '.join([f'**{value}**' for value in chosen] + off[chosen])} |" in page
 
 
 def test_figures_of_verdicts_are_those_of_the_chart():
@@ -554,12 +468,13 @@ def test_sessions_and_rates_in_other_places_are_the_stored_ones():
     rendered = [table["rendered"]["rows"][-1] for table in both]
     held, alone = (sum(round(row[i]["value"] * row[i]["n"]) for row in rendered) for i in (1, 4))
     sessions = sum(row[1]["n"] for row in rendered)
-    assert f"{held} of {sessions} sessions of 20 lay in their intervals; by the former rule {alone}." in words(NOTEBOOK)
+    said = f"{held} of {sessions} sessions of 20 lay in their intervals; where photographs are taken for independent "
+    assert said + f"{alone}." in words(NOTEBOOK)
     rates = [row for table in both for row in table["elsewhere"]["rows"]]
     assert [row[4] <= row[6]["value"] <= row[5] for row in rates] == [row[7] for row in rates]
     within = sum(row[7] for row in rates)
-    assert f"rate's 95 % interval in {within} of {len(rates)} runs;" in words(NOTEBOOK)
-    assert {row[6]["n"] for row in rates} == {800} and "rate in 800 places" in words(NOTEBOOK)
+    said = f"the rate in 800 places that the promise did not know lay in its interval in {within} of {len(rates)} runs;"
+    assert {row[6]["n"] for row in rates} == {800} and said in words(NOTEBOOK)
 
 
 def test_figures_of_the_ablation_are_the_stored_ones():
@@ -577,7 +492,7 @@ def test_figures_of_the_ablation_are_the_stored_ones():
             for key in ("rate", "rate, path-traced")
         )
         name = told.get(row["trained without"], row["trained without"])
-        assert any(line.startswith(f"| {name} | {earned} | {traced} | ") for line in lines), name
+        assert f"| {name} | {earned} | {traced} |" in lines, name
 
 
 @pytest.mark.parametrize(("name", "count"), [("chances", 8), ("again", 2)])
@@ -640,18 +555,22 @@ def test_charts_say_of_themselves_what_is_stored(name):
     assert first["about"] in words(NOTEBOOK) and f"results/charts/{name}_chart.png" in README.read_text("utf-8")
 
 
-def test_figures_of_benchmarks_and_cards_are_the_stored_ones():
-    points = {row[1]: row[2:4] for row in stored("bench/detect.json")["tables"]["levels_12mp"]["rows"]}
-    (cost, fitted), (_, theirs) = points["1000 px, fitted"], points["1000 px, OpenCV's"]
-    searched = f"searched in {cost['value'] / 1000:.2f} s of one core"
-    assert searched in words(NOTEBOOK) and f"{searched}, the design's corners {fitted['value']:.3f} px" in words(README)
-    assert f"{fitted['value']:.3f} px off" in words(NOTEBOOK) and f"{theirs['value']:.2f} px off" in words(NOTEBOOK)
-    tables = stored("bench/printer.json")["tables"]
-    means, worsts = zip(*(tables[f"{count}_swatches_chosen"]["rows"][-1][1:3] for count in (48, 96)), strict=True)
-    means, worsts = (f"{means[0]['value']:.2f} / {means[1]['value']:.2f}", f"{worsts[0]:.2f} / {worsts[1]:.2f}")
-    assert f"ΔE00 {means} in the mean, worst printer {worsts}" in words(NOTEBOOK)
+def test_figures_of_finding_sheets_are_those_of_the_chart():
+    rows = stored("charts/speed.json")["tables"]["photos"]["rows"]
+    told = {"ours": "ours", "ArUco": "OpenCV's ArUco", "ArUco subpixel": "the same, refined", "AprilTag": "AprilTag"}
+    for name, size, speed, off, right in rows:
+        photograph = size if name == "ours" else ""
+        figures = f"{speed['value']:.2g} | {off['value']:.3f} | {100 * right:.0f} %"
+        assert " ".join(f"| {photograph} | {told[name]} | {figures} |".split()) in words(NOTEBOOK)
+    ours, theirs = (next(row for row in rows if row[:2] == [name, "4000 × 3000"]) for name in ("ours", "ArUco"))
+    said = "found in {} of 24 photographs of 12 megapixels, {:.1f} a second and core, its corners {:.3f} px off in the "
+    said = said.format(round(24 * ours[4]), ours[2]["value"], ours[3]["value"])
+    assert said + f"median; OpenCV's ArUco {theirs[2]['value']:.0f} and {theirs[3]['value']:.3f}" in words(README)
+
+
+def test_figures_of_cards_are_the_stored_ones():
     accuracy = json.loads((PACKAGE / "classifier" / "builtin.json").read_text())["held_out_accuracy"]
-    assert f"| {100 * accuracy:.1f} % of 2,400 |" in words(NOTEBOOK)
+    assert f"names {100 * accuracy:.1f} % of 2,400 renders" in words(NOTEBOOK)
     names = ("coated", "uncoated")  # from profiles
     printers = [json.loads((ROOT / "calibration" / "printers" / f"{name}.json").read_text()) for name in names]
     errors = [printer["provenance"]["delta_e00_to_exact_chain"] for printer in printers]

@@ -48,3 +48,26 @@ def test_what_dealt_folders_prove_in_the_notebook_is_what_is_stored():
         "found as {:.2f}, three that are dealt into 60 and 20 folders without times as {:.1f} and {:.1f}".format(*found)
         in page
     )
+
+
+def test_what_looks_and_controls_prove_in_the_notebook_is_what_is_stored():
+    results = Path(session_trials.__file__).parents[1] / "results"
+    page = " ".join((results / "measured.md").read_text("utf-8").split())
+    of = {
+        name: list(csv.DictReader((results / f"sessions/session-trials_{name}.csv").read_text("utf-8").splitlines()))
+        for name in ("looks", "controls")
+    }
+    for looks in ("each session", "watched"):
+        rows = [row for row in of["looks"] if row["looks"] == looks]
+        with_limit, without = (
+            " / ".join(f"{1600 * float(row[name]):.0f}" for row in rows) for name in ("kept", "without a limit")
+        )
+        assert f"{with_limit} of 1600 ({without})" in page
+    equal = [row for row in of["controls"] if row["patch"] == row["control"]]
+    by_rho = {rho: [row for row in equal if row["correlation"] == rho] for rho in ("0.0", "0.1", "0.2", "0.3")}
+    shares, by_photos = (
+        " / ".join(f"{100 * np.mean([float(row[name]) for row in rows]):.1f}".lstrip("0") for rows in by_rho.values())
+        for name in ("called better", "by photographs")
+    )
+    worst = " / ".join(f"{100 * max(float(row['called better']) for row in rows):.1f}" for rows in by_rho.values())
+    assert f"| {shares} % ({by_photos} %); the worst kind {worst} % |" in page

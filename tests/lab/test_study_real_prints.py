@@ -109,27 +109,30 @@ def test_figures_in_the_notebook_are_the_stored_ones():
     assert f"| {float(every['ΔE00 in the best conditions']):.2f} [" in page
     name = "rms about a cubic, in sRGB"
     assert "| {:.3f} [{:.3f}, {:.3f}] (".format(*(float(every[name + end]) for end in ("", "_low", "_high"))) in page
-    all_places = {row["conditions"]: row for row in rows["places"] if row["twins of"] == "all"}
-    former, default, plain = (
-        [100 * float(all_places[way][f"bias of the effect{end}"]) for end in ("", "_low", "_high")]
-        for way in ("former", "default", "without mottle")
-    )
-    said = "{:.1f} % [{:.1f}, {:.1f}] with the former default, {:.1f} % [{:.1f}, {:.1f}] now, {:.1f} % without mottle"
-    assert said.format(*former, *default, plain[0]) in page
-    rates = (100 * float(row["bias of the rate"]) for row in all_places.values())
-    assert "rate by {:.1f}, {:.1f} and {:.1f} points".format(*rates) in page
+
+    def estimate(row: dict[str, str], name: str, form: str) -> str:
+        return form.format(*(100 * float(row[name + end]) for end in ("", "_low", "_high")))
+
+    for row in rows["places"]:
+        effect = estimate(row, "bias of the effect", "{:.1f} % [{:.1f}, {:.1f}]")
+        rate = estimate(row, "bias of the rate", "{:.1f} points [{:.1f}, {:.1f}]")
+        cells = [row["conditions"], row["twins of"], effect, rate, f"{100 * float(row['sessions inside']):.0f} %"]
+        if row["conditions"] != "without mottle" or row["twins of"] == "all":
+            assert f"| {' | '.join(cells)} |" in page
+    scenes = {"light": "traffic light", "pickup": "pickup", "postbox": "letter box", "suv": "SUV"}
+    for row in rows["designs"]:
+        before, now = (f"{100 * float(row[f'by {which} conditions']):.1f} %" for which in ("former", "default"))
+        gain = estimate(row, "gain", "{:+.1f} [{:.1f}, {:.1f}]")
+        assert f"| {scenes[row['scene']]} | {row['seed']} | {before} | {now} | {gain} |" in page
     gains = mean([float(row["gain"]) for row in rows["designs"]])
     assert f"{100 * gains.value:.1f} points in the mean [{100 * gains.low:.1f}, {100 * gains.high:.1f}]" in page
     fits = [row for row in rows["fits"] if row["twins of"] == "all"]
-    fit, alone, rms, quadratic = (
-        [f"{float(row[key]):.2f}" for row in fits]
-        for key in ("print fit", "default printer", "print fit, rms", "quadratic, rms")
-    )
-    said = "bias {} and {} (traffic light), {} and {} (pickup), {} and {} (letter box), {} and {} (SUV)"
-    assert said.format(*fit) in page and f"{', '.join(alone[:-1])} and {alone[-1]}; rms" in page
-    assert f"rms {', '.join(rms)} beside {', '.join(quadratic)} of a quadratic" in page
+    for row in fits:
+        fit, alone = (f"{float(row[name]):+.2f}" for name in ("print fit", "default printer"))
+        rms, quadratic = (f"{float(row[name]):.2f}" for name in ("print fit, rms", "quadratic, rms"))
+        assert f"| {scenes[row['scene']]} | {row['seed']} | {fit}, {rms} | {alone} | {quadratic} |" in page
     no_larger = sum(float(row["print fit, rms"]) <= float(row["quadratic, rms"]) for row in fits)
-    assert f"no larger in {no_larger} of {len(fits)}" in page
+    assert f"no larger than the quadratic's in {no_larger} of {len(fits)}" in page
 
 
 def test_a_print_fit_shows_colors_that_our_conditions_make_and_a_printer_alone_does_not():
