@@ -41,7 +41,7 @@ def folder(tmp_path):
 def test_conditions_hold_the_photographs_that_they_make_and_no_others(folder):
     (colors,) = run_study("real-prints", folder / "s.toml", folder / "out").tables
     distance, within = ({row[0]: row[i].value for row in colors.rows} for i in (1, 2))
-    assert distance["place A desk"] < 0.5 and distance["place A window"] < 0.5
+    assert distance["place A desk"] < 0.5 and distance["place A window"] < 0.5 and distance["place B door"] > 5
     assert within["print A-one"] > 0.9 and within["print B-two"] < 0.3
 
 
@@ -106,7 +106,8 @@ def test_figures_in_the_notebook_are_the_stored_ones():
     page = (results / "measured.md").read_text("utf-8")
     every = rows["colors"][0]
     assert f"| {100 * float(every['cells within the conditions']):.1f} % [" in page
-    assert f"| {float(every['ΔE00 in the best conditions']):.2f} [" in page
+    distance = (float(every["ΔE00 in the best conditions" + end]) for end in ("", "_low", "_high"))
+    assert "| {:.2f} [{:.2f}, {:.2f}] |".format(*distance) in page
     name = "rms about a cubic, in sRGB"
     assert "| {:.3f} [{:.3f}, {:.3f}] (".format(*(float(every[name + end]) for end in ("", "_low", "_high"))) in page
 

@@ -1,9 +1,10 @@
 """Separate a printer's inks from the light and camera of the photographs that show its known colors.
 
 In: cells of known color in photographs of several places, N×3 sRGB sent and N×3 light over white paper. Out: one map
-from the color sent to the light of the ink, as a printer, too; and the light that one photograph shows of a printer
-at best. Place and camera make veil, gains, tone and chroma of that light, by the channel's own formulas. The map is
-a quadratic in sRGB's code values after a known printer, which takes colors that were never printed from that printer.
+from the color sent to the light of the ink, as a printer, too; and the light that default conditions make of a printer
+for one photograph at best. Place and camera make veil, gains, tone and chroma of that light, by the channel's own
+formulas. The map is a quadratic in sRGB's code values after a known printer, which takes colors that were never printed
+from that printer.
 
 Ink and photographs are told apart only as far as photographs differ: what all of them share (one phone's tone curve, a
 veil that is in every place) is in the map. Photographs of one place share their veil's color but not its strength, for
@@ -12,20 +13,23 @@ the angle to the lamp changes it. Left out on purpose: light that changes within
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
+from torch.nn.functional import pad
 
-from patchproof.base.color import lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
+from patchproof.base.settings import CameraSettings, PrinterSettings
 from patchproof.calibrate.chart import printer_of
 from patchproof.channel.printer import Printer, printer_output, vary_print
 
-_CENTER = (0.025, 0.025, 0.025, 0.0, 0.0, 0.0, 0.0, -0.075)  # of the terms in the default conditions
+_CENTER = (-0.075, 0.025, 0.025, 0.025, 0.0, 0.0, 0.0, 0.0)  # of the terms in the default conditions
 _CENTERED = 100.0  # of the mean terms' squared distance from there: what all photographs share is in the ink
 _RIDGE = 0.05  # of the photographs' terms, per squared unit: keeps what cells cannot tell near its default
+_LOG_GAIN = (-1.0, 1.0)
 _STEPS = 150
 _ROBUST_DELTA_E = 1.0  # CIELAB distances below count by their square
 
@@ -56,11 +60,9 @@ def ink_light(printed: Tensor, ink: Tensor) -> Tensor:
 
 
 def photo_light(light: Tensor, terms: Tensor) -> Tensor:
-    """Return the light N×3 that photographs show; `terms` N×8 (veil, log gains, tone, chroma)."""
-    veil, log_gains, tone, chroma = terms.split((3, 3, 1, 1), 1)
-    none = torch.zeros_like(tone)
-    seen = vary_print(light, torch.cat([none, none, chroma, veil], 1)) * log_gains.exp()
-    return linear_from_srgb(lift_tone(srgb_from_linear(seen.clamp(1e-6, 1)), tone))
+    """Return the light N×3 that photographs show; `terms` N×10 (dot gain, density, chroma, veil, log gains, tone)."""
+    seen = vary_print(light, terms[:, :6]) * terms[:, 6:9].exp()
+    return linear_from_srgb(lift_tone(srgb_from_linear(seen.clamp(1e-6, 1)), terms[:, 9:]))
 
 
 def fit_printer(cells: KnownColors, start: Printer) -> Printer:
@@ -72,50 +74,47 @@ def fit_printer(cells: KnownColors, start: Printer) -> Printer:
     ink.requires_grad_()
     terms.requires_grad_()
     rows, center = torch.tensor(index), torch.tensor(_CENTER, dtype=torch.float64)
+    search = torch.optim.LBFGS([ink, terms], max_iter=_STEPS, history_size=20, line_search_fn="strong_wolfe")
 
-    def predict() -> Tensor:
-        return photo_light(ink_light(printed, ink), terms.index_select(0, rows))
+    def loss() -> Tensor:
+        search.zero_grad()
+        light = photo_light(ink_light(printed, ink), pad(terms.index_select(0, rows), (2, 0)))
+        apart = lab_from_linear(light.clamp(1e-6, 1)) - lab_from_linear(seen)
+        value = ((apart**2).sum(1) + _ROBUST_DELTA_E**2).sqrt().mean()
+        value += _RIDGE * (terms**2).sum() + _CENTERED * ((terms.mean(0) - center) ** 2).sum()
+        value.backward()
+        return value
 
-    _minimize(
-        [ink, terms],
-        lambda: (
-            _distance(predict(), seen) + _RIDGE * (terms**2).sum() + _CENTERED * ((terms.mean(0) - center) ** 2).sum()
-        ),
-    )
+    search.step(loss)
     light = lambda colors: srgb_from_linear(ink_light(_printed(255 * colors, start), ink.detach())).numpy()  # noqa: E731
     return printer_of("left-out", light, {"source": "a study"})
 
 
 def fit_photo(cells: KnownColors, printer: Printer) -> np.ndarray:
-    """Fit one photograph's terms to its cells, and return the light N×3 that they predict."""
-    light, seen = linear_from_srgb(_printed(cells.code, printer)), _tensor(cells.light).clamp(0, 1)
-    terms = torch.zeros(1, 8, dtype=torch.float64, requires_grad=True)
-    _minimize(
-        [terms], lambda: _distance(photo_light(light, terms.expand(len(light), 8)), seen) + 1e-3 * (terms**2).sum()
-    )
-    with torch.no_grad():
-        return photo_light(light, terms.expand(len(light), 8)).numpy()
+    """Return the light N×3 that default conditions make of a printer where its median cell is nearest to the
+    photograph's in ΔE00. How the light of paper was read, a gain for each channel, is free.
+    """
+    light, lab = linear_from_srgb(_printed(cells.code, printer)), lab_from_linear(cells.light)
+    table = PrinterSettings()
+    bounds = [table.dot_gain, table.density, table.chroma, *[table.veil] * 3, *[_LOG_GAIN] * 3, CameraSettings().tone]
+    low, high = np.array(bounds, float).T
+
+    def shown(terms: np.ndarray) -> np.ndarray:
+        return photo_light(light, _tensor(terms).expand(len(light), len(bounds))).numpy()
+
+    def distances(terms: np.ndarray) -> np.ndarray:
+        return ciede2000(lab_from_linear(shown(terms)), lab)
+
+    terms = minimize(lambda terms: distances(terms).mean(), (low + high) / 2, bounds=bounds).x
+    for share in (0.3, 0.1):  # the median has no slope to follow, and a simplex of one size gets stuck
+        corners = np.clip(terms + np.vstack([0 * low, np.diag(share * (high - low) / 2)]), low, high)
+        simplex = {"method": "Nelder-Mead", "options": {"initial_simplex": corners}}
+        terms = minimize(lambda terms: np.median(distances(terms)), terms, bounds=bounds, **simplex).x
+    return shown(terms)
 
 
 def _printed(code: np.ndarray, printer: Printer) -> Tensor:
     return _tensor(printer_output(printer, code / 255))
-
-
-def _distance(light: Tensor, seen: Tensor) -> Tensor:
-    apart = lab_from_linear(light.clamp(1e-6, 1)) - lab_from_linear(seen)
-    return ((apart**2).sum(1) + _ROBUST_DELTA_E**2).sqrt().mean()
-
-
-def _minimize(parameters: list[Tensor], loss: Callable[[], Tensor]) -> None:
-    search = torch.optim.LBFGS(parameters, max_iter=_STEPS, history_size=20, line_search_fn="strong_wolfe")
-
-    def closure() -> Tensor:
-        search.zero_grad()
-        value = loss()
-        value.backward()
-        return value
-
-    search.step(closure)
 
 
 def _tensor(values: np.ndarray) -> Tensor:
