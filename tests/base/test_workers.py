@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import signal
 import time
 from concurrent.futures import Future
@@ -242,4 +243,14 @@ def test_a_cluster_that_does_not_answer_is_refused_in_a_sentence(monkeypatch):
     monkeypatch.setattr("patchproof.base.workers._CONNECT_TIMEOUT_S", 1)
     for address in ("tcp://127.0.0.1:9", "not an address"):
         with pytest.raises(Refused, match="a Dask scheduler"), open_workers(cluster=address):
+            pass
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_without_workers_is_refused_in_a_sentence(monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="needs dask: pip install 'patchproof[cluster]'")
+    monkeypatch.setattr("patchproof.base.workers._WORKERS_TIMEOUT_S", 0.5)
+    with distributed.LocalCluster(n_workers=0, dashboard_address=None, processes=False) as cluster:
+        start = re.escape(f"got none: start some: dask worker {cluster.scheduler_address}")
+        with pytest.raises(Refused, match=start), open_workers(cluster=cluster.scheduler_address):
             pass

@@ -22,6 +22,7 @@ from concurrent import futures
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
+from logging import CRITICAL, getLogger
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ _Task = Callable[[Any], Any]
 _Item = tuple[int, Any]  # its number, and the item
 MAX_TRIES = 3  # of an item whose worker dies each time
 _LEAST_QUEUED = 16  # on a cluster at a time, or twice its threads: its scheduler holds the function with every item
-_CONNECT_TIMEOUT_S = 10  # to a cluster's scheduler
+_CONNECT_TIMEOUT_S, _WORKERS_TIMEOUT_S = 10, 60  # to a cluster's scheduler, whose workers may be starting
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds of processor time per period
 
 
@@ -134,12 +135,19 @@ def _connect_client(address: str) -> Any:
         from distributed import Client
     except ImportError:
         raise Refused("dask.distributed for --cluster", "none", 'pip install "patchproof[cluster]"') from None
+    getLogger("distributed.client").setLevel(CRITICAL)  # a lost scheduler is said in one sentence
     try:
-        return Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
+        client = Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         do = "start dask scheduler there, or correct the address"
         raise Refused("a Dask scheduler, such as tcp://host:8786", f"{address} ({reason})", do) from error
+    try:
+        client.wait_for_workers(1, timeout=_WORKERS_TIMEOUT_S)
+    except TimeoutError as error:
+        client.close()
+        raise Refused(f"workers of {address}", "none", f"start some: dask worker {address}") from error
+    return client
 
 
 @contextmanager

@@ -225,8 +225,10 @@ def find_in_photos(
         by_last_part.setdefault(PurePosixPath(name).name, []).append(name)
     found, uses = list[Found | None](), dict[str, str]()
     for photo, path in photos:
-        alike = [each for each in by_last_part.get(PurePosixPath(photo).name, ()) if _ends_alike(each, photo)]
-        near = [photo] if photo in drawn else alike
+        like = by_last_part.get(PurePosixPath(photo).name, ())
+        near = (
+            [photo] if photo in drawn else [e for e in like if f"/{photo}".endswith(f"/{e}") or e.endswith(f"/{photo}")]
+        )
         if len(near) > 1 or (near and uses.setdefault(near[0], photo) != photo):
             got = f"{near[0]} and {near[1]}" if len(near) > 1 else f"{near[0]} for {uses[near[0]]}, too,"
             raise Refused("one row for each photograph", f"{got} for {photo}", "write folder and file in each row")
@@ -235,11 +237,6 @@ def find_in_photos(
         do = "name the files in it as the photographs"
         raise Refused(f"{kind} of these photographs", f"{kind} in {summarize_names(list(drawn))}", do)
     return found, {name: each for name, each in drawn.items() if name not in uses}
-
-
-def _ends_alike(name: str, other: str) -> bool:
-    pairs = zip(name.split("/")[::-1], other.split("/")[::-1], strict=False)
-    return all(a == b for a, b in pairs)
 
 
 def box_of_photo(box: Drawn, name: str, path: Path) -> BoxEdges | None:

@@ -216,11 +216,12 @@ def _marker_corners(grid: TileGrid, part: RectMm) -> list[PointMm]:
 def _tile_texts(template: Template, grid: TileGrid, tile: TilePlan, sheet_id: str) -> list[TextLine]:
     """The tile's name above it, and on each flap the name of the tile to glue on it."""
     x, y, w, h = tile.page_rect_mm
-    top = template.margin_mm + 3.4
+    top, flaps = template.margin_mm + 3.4, [name for name in (tile.right, tile.below) if name]
+    under = f"; the white {'flaps go' if len(flaps) > 1 else 'flap goes'} under {' and '.join(flaps)}" if flaps else ""
     lines = [
         TextLine(at_mm=(x, top), size_mm=3.6, text=tile.name, bold=True),
         TextLine(at_mm=(x + 9, top), size_mm=2.2, text=f"patchproof {sheet_id}", gray=0.35),
-        TextLine(at_mm=(x, top + 3.4), size_mm=2.0, text=f"Cut along the dashed line{_and_flaps(tile)}.", gray=0.35),
+        TextLine(at_mm=(x, top + 3.4), size_mm=2.0, text=f"Cut along the dashed line{under}.", gray=0.35),
     ]
     if w < 60:  # a narrow tile has room for its name only
         lines = lines[:2] if w > 45 else lines[:1]
@@ -233,8 +234,3 @@ def _tile_texts(template: Template, grid: TileGrid, tile: TilePlan, sheet_id: st
         start = (x + 4.0, y + h + grid.overlap_mm / 2 + 1.2)
         lines.append(TextLine(at_mm=start, size_mm=2.2, text=f"glue {tile.below} here", gray=0.35))
     return lines
-
-
-def _and_flaps(tile: TilePlan) -> str:
-    flaps = [name for name in (tile.right, tile.below) if name]
-    return f"; the white {'flaps go' if len(flaps) > 1 else 'flap goes'} under {' and '.join(flaps)}" if flaps else ""
