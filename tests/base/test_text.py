@@ -7,7 +7,7 @@ import warnings
 import pytest
 
 from patchproof.base.csv_file import csv_lines, read_csv
-from patchproof.base.declarations import DECLARED
+from patchproof.base.declarations import load_declarations
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
 from patchproof.base.text import printable
@@ -72,7 +72,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("entry", DECLARED, ids=lambda entry: entry.declares)
+@pytest.mark.parametrize("entry", load_declarations("base"), ids=lambda entry: entry.declares)
 def test_what_text_files_declare_is_used_or_refused(tmp_path, entry):
     read, outcome = CASES[entry.declares]
     said = read(tmp_path)

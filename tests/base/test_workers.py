@@ -241,7 +241,7 @@ def test_a_cluster_gives_the_same_also_when_workers_die(tmp_path):
 def test_a_cluster_that_does_not_answer_is_refused_in_a_sentence(monkeypatch):
     pytest.importorskip("distributed", reason="needs dask: pip install 'patchproof[cluster]'")
     monkeypatch.setattr("patchproof.base.workers._CONNECT_TIMEOUT_S", 1)
-    for address in ("tcp://127.0.0.1:9", "not an address"):
+    for address in ("tcp://127.0.0.1:9", "not an address", "tls://127.0.0.1:9"):
         with pytest.raises(Refused, match="a Dask scheduler"), open_workers(cluster=address):
             pass
 
@@ -253,4 +253,13 @@ def test_a_cluster_without_workers_is_refused_in_a_sentence(monkeypatch):
     with distributed.LocalCluster(n_workers=0, dashboard_address=None, processes=False) as cluster:
         start = re.escape(f"got none: start some: dask worker {cluster.scheduler_address}")
         with pytest.raises(Refused, match=start), open_workers(cluster=cluster.scheduler_address):
+            pass
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_workers_with_other_code_are_refused(monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="needs dask: pip install 'patchproof[cluster]'")
+    monkeypatch.setattr("patchproof.base.workers._read_code", lambda: os.urandom(4).hex())
+    with distributed.LocalCluster(n_workers=1, dashboard_address=None, processes=False) as cluster:
+        with pytest.raises(Refused, match="code of this patchproof"), open_workers(cluster=cluster.scheduler_address):
             pass

@@ -5,6 +5,8 @@ Corners are projected by OpenCV or, once, found in rendered photographs; the len
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -145,8 +147,12 @@ def test_size_of_the_print_does_not_matter_but_its_proportions_do():
         return [BoardView(v.file, v.ids, v.board_mm * scale, v.px, v.size_px) for v in views(2, 10)]
 
     assert solved(printed(0.5)).fit.numbers[:2] == pytest.approx(1300, rel=0.003)
-    with pytest.raises(Refused, match=r"px rms: glue .* --ruler-mm"):
+    with pytest.raises(Refused, match=r"px rms: use one zoom and no crops, glue .*--ruler-mm"):
         solved(printed([0.98, 1.0]))
+    found = solved(views(2, 10))
+    for ratio, said in ((1.0, False), (1.004, False), (1.03, True)):
+        stretched = replace(found, camera=found.camera.changed(fx=found.camera.fy * ratio))
+        assert ("hardly this far from square" in " ".join(calibration_lines(stretched))) == said
     stretched = corner_positions_mm(BOARD, (97.0, 98.0))
     assert stretched == pytest.approx(PLACES * [0.97, 0.98])
 

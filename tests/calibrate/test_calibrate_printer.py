@@ -182,6 +182,11 @@ def test_a_chart_read_in_part_says_what_its_figure_is_worth(monkeypatch, tmp_pat
         with pytest.raises(Refused, match="at least 4 readable swatches, got 3"):
             calibrate_chart([[tmp_path / "a.png"]], manifest, "x")
         return
+    gray = ChartPhoto(light.mean(1, keepdims=True) + np.array([0.0, 0.01, 0.02]), (1.0, 1.0, 1.0))
+    monkeypatch.setattr(chart_module, "read_chart", lambda *_: gray)
+    with pytest.raises(Refused, match="a chart in color, got gray ones: switch black and white off"):
+        calibrate_chart([[tmp_path / "a.png"]], manifest, "x")
+    monkeypatch.setattr(chart_module, "read_chart", lambda *_: read)
     found = calibrate_chart([[tmp_path / "a.png"]], manifest, "x")
     assert any("hardly spread" in warning for warning in found.warnings) == (says is not None or readable == 4)
     if readable == 4:

@@ -96,6 +96,7 @@ def test_an_index_is_one_thing_in_all_networks():
     networks = (("cat", "jeep, landrover"), ("dog", "Jeep"), ("cow", "landrover"))
     refuse_different_entries(networks, 1)
     refuse_different_entries(networks, "cat")
+    refuse_different_entries((), 99)  # that no network has: said elsewhere
     with pytest.raises(Refused, match='got 0, which is "cat" in one of them and "dog" in another: give its name'):
         refuse_different_entries(networks, 0)
 

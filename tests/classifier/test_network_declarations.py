@@ -16,9 +16,9 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from patchproof.app.keys import declarations
+from patchproof.base.declarations import load_declarations
 from patchproof.base.errors import Refused
 from patchproof.classifier import Classifier, center_square, imagenet, load_classifier, wrapping
-from patchproof.classifier.declarations import DECLARED
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.zoo import load_weights, read_weights
 
@@ -270,7 +270,7 @@ CASES: dict[str, tuple[Any, ...]] = {
 }
 
 
-@pytest.mark.parametrize("entry", DECLARED, ids=lambda entry: entry.declares)
+@pytest.mark.parametrize("entry", load_declarations("classifier"), ids=lambda entry: entry.declares)
 def test_what_a_file_declares_is_used_refused_or_said(entry, tmp_path):
     case = CASES[entry.declares]
     with warnings.catch_warnings(action="error"):
@@ -284,7 +284,8 @@ def test_what_a_file_declares_is_used_refused_or_said(entry, tmp_path):
 
 
 def test_the_list_has_no_other_cases_and_is_on_the_page():
-    assert CASES.keys() == {entry.declares for entry in DECLARED} and set(DECLARED) <= set(declarations("Networks"))
+    listed = load_declarations("classifier")
+    assert CASES.keys() == {entry.declares for entry in listed} and set(listed) <= set(declarations("Networks"))
 
 
 HARMLESS = {"mean": [0, 0.0, 0], "std": [1, 1, 1], "channels": 3, "color_mode": "RGB", "range": [0, 1], "bgr": False}

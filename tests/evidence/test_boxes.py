@@ -12,13 +12,15 @@ import torch
 from PIL import Image
 
 import patchproof as pp
+from patchproof.base.declarations import load_declarations
 from patchproof.base.errors import Refused
 from patchproof.classifier.detector import iou
 from patchproof.evidence.annotations import box_of_photo, find_in_photos, load_boxes
 from patchproof.evidence.classify import box_in_square
-from patchproof.evidence.declarations import DECLARED
 
-BOXES_DECLARED = [entry for entry in DECLARED if entry.file == "COCO JSON"]  # corners: see test_corners
+BOXES_DECLARED = [
+    entry for entry in load_declarations("evidence") if entry.file == "COCO JSON"
+]  # corners: see test_corners
 
 
 def coco(

@@ -170,6 +170,14 @@ def test_a_folder_of_raw_files_alone_is_refused_with_their_names(tmp_path):
     assert list_skipped_files(tmp_path / "nowhere") == []
 
 
+def test_archives_and_links_that_lead_nowhere_are_named(tmp_path):
+    (tmp_path / "a.zip").write_bytes(b"x")
+    (tmp_path / "b.jpg").symlink_to(tmp_path / "gone.jpg")
+    archives, links = list_skipped_files(tmp_path)
+    assert archives.startswith("archives") and archives.endswith("a.zip")
+    assert links == "links to files that are not there: b.jpg"
+
+
 def test_codes_of_photographs_come_with_names_and_advice():
     photos = [{"file": f"{i}.jpg", "code": "blurred", "advice": "hold still"} for i in range(5)]
     photos += [{"file": "z.jpg", "code": "tilted", "advice": "turn"}, {"file": "y.jpg", "code": None, "advice": "-"}]

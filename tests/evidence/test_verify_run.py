@@ -28,16 +28,17 @@ from patchproof.base.intervals import wilson
 from patchproof.base.progress import Compute
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
-from patchproof.evidence import gather
+from patchproof.evidence import batch, gather
 from patchproof.evidence.appearance import _cross_fitted_cells, fit_cells, match_design
 from patchproof.evidence.classify import judges_of
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.locate import pinhole_photo
 from patchproof.evidence.measure import measure
+from patchproof.evidence.results import CameraPose, PhotoEntry, Remark, Scale
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.evidence.task import Options, promised_ranges
 from patchproof.photo.quality import FrameLight, is_featureless
-from patchproof.photo.read import MORE_PAGES, Photo
+from patchproof.photo.read import GONE_ADVICE, MORE_PAGES, Photo
 from patchproof.report.words import verdict_lines
 from patchproof.sheets.markers import DICTIONARY, aruco_dictionary
 from patchproof.sheets.piece import marker_ids
@@ -122,6 +123,17 @@ def test_another_design_and_a_print_without_an_ink_do_not_count(printed, code):
     photo = measured(photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2))
     assert not photo.counted and (photo.entry.status, photo.entry.code) == ("rejected", code)
     assert photo.entry.remark.figure < photo.entry.remark.threshold
+
+
+def test_gray_prints_and_photographs_of_a_design_in_two_inks_do_not_count():
+    """Such a design tells no ink from another, but color from none."""
+    share = np.random.default_rng(4).random((14, 14, 2)).repeat(10, 0).repeat(10, 1)
+    design = (255 - share[..., :1] * [220, 60, 20] - share[..., 1:] * [20, 130, 60]).clip(0, 255).astype(np.uint8)
+    gray = np.repeat(design.mean(-1, keepdims=True), 3, -1).astype(np.uint8)
+    for printed, code in ((design, None), (gray, "wrong_ink")):
+        page = page_raster(make_manifest(design=np.ascontiguousarray(printed)), True)
+        photo = photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2)
+        assert measured(photo, manifest=make_manifest(design=design)).entry.code == code
 
 
 def test_a_design_of_one_color_is_told_from_others_by_structure_ink_and_color():
@@ -331,6 +343,14 @@ def test_the_uncut_page_and_scans_are_measured_but_not_counted():
         assert (scale.scale_x, scale.scale_y) == pytest.approx((sx, sy), abs=0.002)
 
 
+def test_that_an_uncut_page_is_not_counted_is_said(tmp_path):
+    save(shot(10, 900, only_piece=False), tmp_path / "page.png")
+    report = verified(tmp_path)
+    assert report.summary.judged == 0
+    said = "photographs of the uncut page, which check the print and are not counted (cut the piece out): page.png"
+    assert report.summary.left_out == (said,)
+
+
 @pytest.mark.parametrize(("dpi", "stretch"), [(150, 1), (75, 2)])
 def test_a_scan_at_another_resolution_than_stated_has_no_scale_and_says_so(dpi, stretch):
     scan = photograph(raster(False), np.diag([75 / 25.4, 75 / 25.4 * stretch, 1.0]), (640, 900 * stretch), light=0.9)
@@ -470,6 +490,17 @@ def test_the_patch_s_own_photographs_are_no_control(few, tmp_path):
     assert any("mean/sent.jpg does not count: it shows the patch, not the control mean" in each for each in said)
 
 
+def test_a_photograph_that_only_workers_miss_ends_the_run_and_is_not_kept(few, tmp_path, monkeypatch):
+    def missing(task, item):
+        return batch._rejected(item, Remark(code="unreadable", advice=GONE_ADVICE))
+
+    monkeypatch.setattr(batch, "_measure_or_reject", missing)
+    journal = tmp_path / "out" / "photos.jsonl"
+    with pytest.raises(Refused, match=r"cluster's machines, too, got none at /.*a\.JPG: let all its"):
+        gather_evidence(few, make_manifest(promise()), Options([NET], identity_printer()), journal=journal)
+    assert "b0.jpg" not in journal.read_text()
+
+
 def test_without_its_workers_no_journal_is_begun(few, tmp_path, monkeypatch):
     def unreachable(*settings):
         raise Refused("a scheduler", "none", "start it")
@@ -479,6 +510,14 @@ def test_without_its_workers_no_journal_is_begun(few, tmp_path, monkeypatch):
     with pytest.raises(Refused, match="a scheduler"):
         gather_evidence(few, make_manifest(promise()), options, journal=tmp_path / "out" / "photos.jsonl")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_camera_is_as_much_nearer_as_the_print_is_smaller():
+    pose = CameraPose(azimuth_uncertainty_deg=2.0, distance_mm=600.0, distance_uncertainty_mm=20.0)
+    entry = gather._of_print(PhotoEntry(file="a.jpg", status="measured", pose=pose), Scale(scale_x=0.96, scale_y=0.98))
+    size = np.sqrt(0.96 * 0.98)
+    assert (entry.pose.distance_mm, entry.pose.distance_uncertainty_mm) == pytest.approx((600 * size, 20 * size))
+    assert gather._of_print(PhotoEntry(file="a.jpg", status="judged"), entry.scale).pose is None
 
 
 @pytest.mark.parametrize(("mm", "scale"), [((100.5, 100), 1.005), ((97, 96.5), 0.97)])

@@ -1,4 +1,4 @@
-"""Each declaration in the list of `photo.declarations` has a file here, and is used, refused or said as the list says.
+"""Each declaration in `photo/declarations.csv` has a file here, and is used, refused or said as the list says.
 
 Files are made by hand or by Pillow; colors are computed from chromaticities and curves, in float64 and not by our code.
 """
@@ -16,8 +16,8 @@ import pytest
 from PIL import Image, ImageChops, ImageCms
 from PIL.TiffImagePlugin import OPEN_INFO
 
+from patchproof.base.declarations import load_declarations
 from patchproof.photo import color_space, read
-from patchproof.photo.declarations import DECLARED
 from patchproof.photo.read import read_photo
 from patchproof.photo.rejection import PhotoRejected
 
@@ -425,7 +425,7 @@ CASES: dict[str, list[tuple[bytes, str, object]]] = {
 }
 
 
-@pytest.mark.parametrize("entry", DECLARED, ids=lambda entry: entry.declares)
+@pytest.mark.parametrize("entry", load_declarations("photo"), ids=lambda entry: entry.declares)
 def test_what_a_picture_declares_is_used_refused_or_said_as_the_list_has_it(entry, reading):
     answers = set()
     for content, suffix, right in CASES[entry.declares]:
@@ -460,4 +460,4 @@ def test_float_light_up_to_65535_is_said_to_be_light(reading):
 
 
 def test_each_case_is_of_an_entry():
-    assert CASES.keys() == {entry.declares for entry in DECLARED}
+    assert CASES.keys() == {entry.declares for entry in load_declarations("photo")}

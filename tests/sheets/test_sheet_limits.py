@@ -16,10 +16,10 @@ from fuzz.pdf_bombs import PDF_BOMBS
 from fuzz.watch import peak_bytes
 
 from patchproof.base import input as bounds
+from patchproof.base.declarations import load_declarations
 from patchproof.base.errors import Refused
 from patchproof.sheets import pdf_raster
 from patchproof.sheets.blank import blank_sheet
-from patchproof.sheets.declarations import DECLARED
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.pdf_raster import attached_manifests, rasterize_page
 
@@ -168,6 +168,6 @@ def test_boxes_that_pages_inherit_are_used_as_their_own(tmp_path):
     assert np.array_equal(inherited, own)
 
 
-@pytest.mark.parametrize("entry", DECLARED, ids=lambda entry: entry.declares)
+@pytest.mark.parametrize("entry", load_declarations("sheets"), ids=lambda entry: entry.declares)
 def test_what_a_pdf_declares_is_used_or_refused(entry, tmp_path):
     assert CASES[entry.declares](tmp_path / "s.pdf")

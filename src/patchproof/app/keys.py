@@ -12,7 +12,6 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from functools import lru_cache, partial
-from importlib import import_module
 from itertools import takewhile
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -20,7 +19,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from pydantic import AfterValidator, BaseModel
 from pydantic.fields import FieldInfo
 
-from patchproof.base.declarations import Declaration
+from patchproof.base.declarations import Declaration, load_declarations
 from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import StrictModel, check_ordered, models_in, spelling_hint
@@ -48,7 +47,7 @@ Printed by `patchproof keys --files` from the lists of the readers. *used*: take
 sentence, exit code 1 (a photograph: rejected with its code). *said*: left aside, with a line in the command's output,
 the preview and the report.
 """
-# the kinds of input, and the rooms in whose `declarations` DECLARED lists what they can declare
+# the kinds of input, and the rooms whose `declarations.csv` lists what they can declare
 READERS = {
     "Meshes": "mesh",
     "Networks": "classifier",
@@ -188,7 +187,7 @@ def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:
 
 def declarations(reader: str) -> tuple[Declaration, ...]:
     """The list of one kind of input in `READERS`."""
-    return import_module(f"patchproof.{READERS[reader]}.declarations").DECLARED
+    return load_declarations(READERS[reader])
 
 
 def codes_table() -> str:

@@ -1,10 +1,11 @@
-"""What files can declare, and what their readers do with each declaration.
+"""What files can declare, and what their readers do with each declaration: the lists `declarations.csv` of the rooms.
 
-`DECLARED` is the list of settings and text files; other readers have theirs in the `declarations.py` of their packages.
 `patchproof keys --files` prints all of them, and the tests hold a file for each entry.
 """
 
-from typing import Literal, NamedTuple
+import csv
+from pathlib import Path
+from typing import NamedTuple
 
 
 class Declaration(NamedTuple):
@@ -12,16 +13,11 @@ class Declaration(NamedTuple):
 
     file: str  # the kind of file, such as "TIFF"
     declares: str  # such as "orientation (tag 274)"
-    answer: Literal["used", "refused", "said"]
+    answer: str
     how: str  # what is done with it, in a few words
 
 
-_FILES = "TOML, JSON, CSV"
-DECLARED: tuple[Declaration, ...] = (
-    Declaration(_FILES, "UTF-8, with or without a byte order mark", "used", "the mark is skipped"),
-    Declaration(_FILES, "UTF-16, with or without a byte order mark", "refused", "it is named: save it as UTF-8"),
-    Declaration(_FILES, "bytes that are not UTF-8, such as Latin-1", "refused", "line and byte are named"),
-    Declaration("TOML, JSON", "an unknown key of settings", "refused", "with the nearest known one"),
-    Declaration("CSV", "semicolons or tabs as separators", "refused", "they are named: save it with commas"),
-    Declaration("CSV", "an apostrophe before a formula", "used", "it is no part of the text"),
-)
+def load_declarations(room: str) -> tuple[Declaration, ...]:
+    """Load the list of the readers in a room of this package."""
+    lines = (Path(__file__).parents[1] / room / "declarations.csv").read_text(encoding="utf-8").splitlines()
+    return tuple(Declaration(*row) for row in csv.reader(lines[1:]))

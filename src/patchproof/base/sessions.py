@@ -66,7 +66,9 @@ class RatePosterior:
         """The smallest rate at which `recognized` photographs or more have a chance of `tail`; the observed count
         itself counts half (mid-p). Sessions differ as much as the posterior says.
         """
-        return _least_rates(*self._marginal(), tuple(sorted(photos)), tail)[recognized]
+        values, inverse = np.unique(self.correlations, return_inverse=True)
+        marginal = tuple(values), tuple(np.bincount(inverse, self.weights))
+        return _least_rates(*marginal, tuple(sorted(photos)), tail)[recognized]
 
     def most_rate(self, recognized: int, photos: Sequence[int], tail: float) -> float:
         """The largest rate at which `recognized` photographs or fewer are recognized with a chance of `tail`."""
@@ -75,11 +77,6 @@ class RatePosterior:
     def rate_given(self, recognized: int, photos: Sequence[int]) -> tuple[float, float]:
         """The 95 % interval of a rate by new sessions' photographs, which differ as much as the posterior says."""
         return self.least_rate(recognized, photos, TAIL), self.most_rate(recognized, photos, TAIL)
-
-    def _marginal(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The marginal posterior of the correlation: values and weights."""
-        values, inverse = np.unique(self.correlations, return_inverse=True)
-        return tuple(values), tuple(np.bincount(inverse, self.weights))
 
 
 def rate_posterior(recognized: Sequence[int], photos: Sequence[int]) -> RatePosterior:

@@ -22,6 +22,7 @@ from concurrent import futures
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
+from hashlib import sha256
 from logging import CRITICAL, getLogger
 from pathlib import Path
 from typing import Any
@@ -137,8 +138,8 @@ def _connect_client(address: str) -> Any:
         raise Refused("dask.distributed for --cluster", "none", 'pip install "patchproof[cluster]"') from None
     getLogger("distributed.client").setLevel(CRITICAL)  # a lost scheduler is said in one sentence
     try:
-        client = Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
+        client: Any = Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError, TimeoutError) as error:  # TypeError: tls:// without its certificates
         reason = " ".join(str(error).split()) or type(error).__name__
         do = "start dask scheduler there, or correct the address"
         raise Refused("a Dask scheduler, such as tcp://host:8786", f"{address} ({reason})", do) from error
@@ -147,7 +148,21 @@ def _connect_client(address: str) -> Any:
     except TimeoutError as error:
         client.close()
         raise Refused(f"workers of {address}", "none", f"start some: dask worker {address}") from error
+    try:
+        codes = set(client.run(_read_code).values())
+    except Exception:  # a module that they lack, or whatever else they run
+        codes = {None}
+    if codes != {_read_code()}:
+        client.close()
+        do = "install this version there, and start them again"
+        raise Refused("workers with the code of this patchproof", "another or none on some of them", do)
     return client
+
+
+def _read_code() -> str:
+    """SHA-256 of the package's code."""
+    files = sorted(Path(__file__).parents[1].rglob("*.py"))
+    return sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 @contextmanager

@@ -40,6 +40,7 @@ MIN_TURN_DEG = 10.0  # between the two boards that differ most; users are asked 
 MAX_FOCAL_SHARE = 0.01  # one standard deviation of the focal length
 GOOD_COVERAGE = 0.75  # of the half diagonal; distortion is largest beyond it
 _TRIAL_RUNG = "k1 k2"  # models any lens of the ladder well enough to find odd photographs
+_MOST_UNEQUAL = 0.005  # of the focal lengths across and down, above four standard deviations
 _MAX_RMS_PX = 1.0  # rms for a picture of 2 megapixels or less; sharp photographs of flat boards have 0.05 to 0.3
 _ODD_PHOTO_RATIO, _ODD_CORNER_RATIO, _ODD_PX = 3.0, 5.0, 0.5  # ratios to the median error, above _ODD_PX
 
@@ -120,6 +121,8 @@ def calibration_lines(result: CameraCalibration) -> list[str]:
         f"{fit.tilts_deg.max():.0f}°",
     ]
     lines += [f"left out: {file}: {reason}" for file, reason in result.left_out.items()]
+    if abs(np.log(camera.fx / camera.fy)) > max(_MOST_UNEQUAL, 4 * float(np.hypot(*fit.sd[:2])) / camera.fx):
+        lines.append("warning: pixels are hardly this far from square: measure both rulers, and use --ruler-mm")
     if result.coverage < GOOD_COVERAGE:
         lines.append(
             f"warning: the board's corners reach {result.coverage:.0%} of the way to the picture's corners; "
@@ -231,7 +234,7 @@ def _refuse_undetermined(fit: LensFit) -> None:
     turns = np.degrees(np.arccos(np.clip(fit.normals @ fit.normals.T, -1, 1))).max()
     share = max(fit.sd[0] / fit.numbers[0], fit.sd[1] / fit.numbers[1])
     if fit.rms_px > _MAX_RMS_PX * max(1.0, float(np.hypot(*fit.numbers[2:4])) / 1000):
-        do = "glue the board to something flat, measure both of its rulers and type them in with --ruler-mm"
+        do = "use one zoom and no crops, glue the board to something flat, measure both of its rulers (--ruler-mm)"
         expected = "photographs of a flat board that a lens model explains"
         raise Refused(expected, f"residuals of {fit.rms_px:.1f} px rms", do)
     if turns < MIN_TURN_DEG or share > MAX_FOCAL_SHARE:

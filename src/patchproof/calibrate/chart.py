@@ -45,6 +45,7 @@ MIN_SWATCHES = 4  # paper, black and two others
 MAX_PHOTO_DELTA_E00 = 5.0  # from its print's other photographs: more than light or camera can explain
 MIN_CORE_PX = 4.0  # a swatch's side between blurred borders
 MAX_CLIPPED_SHARE = 0.05  # share of white paper at full white; beyond it, its light is unknown
+_LEAST_CHROMA = 0.05  # in linear light, between the channels of the most colorful swatch: saturated inks have 0.5
 _CORE_MARGIN = 0.2  # of a swatch's side: the least margin on each side
 _SAMPLES = 15  # along each side of a core
 _SEARCH_MM = 60.0  # bare paper is searched for within this distance of the chart
@@ -79,6 +80,9 @@ def calibrate_chart(
     if usable.sum() < MIN_SWATCHES:
         do = "photograph the whole chart from closer, sharp and not overexposed"
         raise Refused(f"at least {MIN_SWATCHES} readable swatches", f"{usable.sum()}", do)
+    if np.ptp(light[usable], axis=1).max() < _LEAST_CHROMA:
+        do = "switch black and white off, in the printer's settings and the camera's"
+        raise Refused("photographs of a chart in color", "gray ones", do)
     choice = choose_map(map_kinds(known_printers()), sent[usable], srgb_from_linear(light[usable]))
     photographs = []
     for number, group in readings.items():

@@ -18,7 +18,7 @@ def find_labels(labels: Sequence[str], label: str | int, accept: Sequence[str | 
 
 def refuse_different_entries(networks_labels: Sequence[Sequence[str]], label: str | int) -> None:
     """Refuse an index whose entries have no name in common with the first network's: they are different things."""
-    if isinstance(label, int):
+    if isinstance(label, int) and networks_labels:
         first, *others = (labels[label] for labels in networks_labels)
         if other := next((entry for entry in others if not _names(entry) & _names(first)), None):
             got = f'{label}, which is "{first}" in one of them and "{other}" in another'

@@ -44,17 +44,21 @@ _CODE_ERROR = 0.8  # of a cell, by rounding and JPEG: from 2 to 5 stops too dark
 _LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # multiplies white noise by 6
 LEAST_FOUND = 0.35  # of the cells with detail, in their places: other designs show 0.33 at most, its own prints 0.8
 LEAST_LIKENESS = 0.6  # correlation of structure
-LEAST_INK, WEAK_INK = 0.2, 0.3  # contrast: of the strongest ink's
+LEAST_INK, WEAK_INK = (
+    0.2,
+    0.3,
+)  # contrast: of the strongest ink's; chroma of the promised: real prints keep 0.4, gray 0.04
 _LEAST_PLAIN_INK = 0.55  # the same of grays without structure, by the light absorbed: real prints have 0.65 and more
 _MOST_COLOR = 36.0  # ΔE00 of one color: 177 of real prints are off by 27 at most from `office`, by 35 from `coated`
 _LEAST_CELLS, _LEAST_DETAILED = 40, 6
 # of the square root of light: promised, and shown where none is: glare makes 0.04, other designs 0.09 and more
 _LEAST_STRUCTURE, _MOST_STRUCTURE = 0.01, 0.065
 _SURROUNDINGS = 1 / 8  # of the shorter side: standard deviation of the mean that is subtracted
-_LEAST_CHROMA, _LEAST_COLORFUL = 0.1, 0.15  # of the largest singular value: of the gains, in the design's colors
+_LEAST_CHROMA, _LEAST_COLORFUL = 0.05, 0.15  # of the colors' largest singular value: the second's and the third's
 _INKS = ("cyan", "magenta", "yellow")
 _OTHER_ADVICE = "this is another design than the sheet's: name that design's JSON, or print this sheet"
 _INK_ADVICE = "{} ink is missing or wrong, or the print is gray: check the printer's inks and nozzles and print again"
+_GRAY_ADVICE = "print or photograph are gray: switch black and white off, in the printer's settings and the camera's"
 _WEAK_ADVICE = "{} ink is weak in this print: it counts, but check the printer's nozzles before you print more"
 _UNTOLD_ADVICE = "too little of the design is resolved to tell it from another: come closer"
 
@@ -236,12 +240,13 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
         return DesignMatch(trouble=_plain_trouble(looks, promised, structure_y))
     gains = _robust_gains(x, y)
     likeness, diagonal = float(np.corrcoef((x @ gains).ravel(), y.ravel())[0, 1]), np.diag(gains)
-    largest, second, _ = np.linalg.svd(gains, compute_uv=False)
     contrast, ink = float(diagonal.min() / max(diagonal.max(), 1e-6)), _INKS[int(diagonal.argmin())]
-    contrast = contrast if second > _LEAST_CHROMA * largest else 0.0
     if not likeness >= LEAST_LIKENESS or diagonal.max() <= 0:  # a negative is another design
         return DesignMatch(likeness)
-    own = np.linalg.svd(x, compute_uv=False)
+    own, found = (np.linalg.svd(colors, compute_uv=False) for colors in (x, x @ gains))
+    chroma = float(found[1] * own[0] / max(found[0] * own[1], 1e-9))
+    if own[1] > _LEAST_CHROMA * own[0] and chroma < LEAST_INK:
+        return DesignMatch(likeness, PhotoRejected("wrong_ink", chroma, LEAST_INK, _GRAY_ADVICE))
     if own[2] < _LEAST_COLORFUL * own[0]:  # a design in gray or two inks tells no contrasts: compare its two colors
         centered = promised - promised.mean(0)
         along = centered @ np.linalg.svd(centered, full_matrices=False)[2][0]

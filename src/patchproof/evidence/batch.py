@@ -46,7 +46,7 @@ from patchproof.photo import detect
 from patchproof.photo.exif import has_camera_shape, time_and_camera
 from patchproof.photo.limits import MOST_BYTES, run_limited
 from patchproof.photo.quality import FrameLight, is_featureless
-from patchproof.photo.read import read_photo
+from patchproof.photo.read import GONE_ADVICE, read_photo
 from patchproof.photo.registration import DesignCorners
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest
@@ -56,6 +56,7 @@ MAX_PICTURED_PHOTOS = 120  # photographs whose pictures are on the page; the res
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED_ADVICE = "measuring it ended its process each time, for want of memory: save it smaller"
+_UNCUT = "photographs of the uncut page, which check the print and are not counted (cut the piece out)"
 _EMPTY_ADVICE = "it shows one tone or noise and nothing else: take it again"
 # Longer side of the copy of a control's photograph that is searched for sheets (a full search of one that shows none
 # takes a second), and the markers that prove a sheet.
@@ -218,6 +219,9 @@ def measure_all(
         except WorkerDied:
             measured = _rejected(item, Remark(code="unreadable", advice=_DIED_ADVICE))
         entry, squares, sha256 = measured.entry, measured.squares, file_sha256(item.path)
+        if sha256 and entry.remark and entry.remark.advice == GONE_ADVICE:
+            do = "let all its machines see them at the same paths"
+            raise Refused("the photographs on a cluster's machines, too", f"none at {item.path}", do)
         predictions = judges.predictions(squares, entry.box) if judges and squares is not None else {}
         entry = entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
@@ -271,6 +275,8 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     said = photo.said
     if task.scan_dpi and not measured.counted and any(abs(dpi / task.scan_dpi - 1) > 0.01 for dpi in photo.dpi if dpi):
         said += (_OTHER_DPI.format(*photo.dpi, task.scan_dpi),)
+    if entry.status == "measured" and not measured.counted and not task.scan_dpi:
+        said += (_UNCUT,)
     entry = entry.changed(box=box or entry.box, said=said)
     return replace(measured, entry=entry, pictures=pictures, squares=squares, trace=_trace(item.path, photo.srgb))
 

@@ -69,11 +69,12 @@ def gather_evidence(
     print_scale = None if options.ruler_mm is None else ruler_scale(options.ruler_mm, manifest.ruler_mm)
     controls_folder = None if options.controls is None else Path(options.controls)
     grouping = group_sessions(photos, controls_folder)
-    by_control, paths = _list_controls(controls_folder, grouping.names), grouping.paths
+    by_control = _list_controls(controls_folder, grouping.names)
+    paths = [path.absolute() for path in grouping.paths]  # workers of a cluster may stand in other folders
     judges, count = judges_of(options.models, manifest), len(paths)
     task = task_of(manifest, options, judges)
     items = [PhotoItem(path, grouping.file(i), with_pictures=i < MAX_PICTURED_PHOTOS) for i, path in enumerate(paths)]
-    items += [PhotoItem(path, file, name) for name, files in by_control.items() for file, path in files.items()]
+    items += [PhotoItem(path.absolute(), file, name) for name, e in by_control.items() for file, path in e.items()]
     left_out = list_skipped_files(Path(photos), controls_folder and controls_folder.resolve())
     if options.boxes or options.corners:
         from patchproof.evidence.annotations import box_of_photo, corners_of_photo, find_in_photos
@@ -230,8 +231,17 @@ def report_of(
         models=rates,
     )
     if print_scale is not None:
-        entries = [entry if entry.scale else entry.changed(scale=print_scale) for entry in entries]
+        entries = [entry if entry.scale else _of_print(entry, print_scale) for entry in entries]
     return Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary, controls=tuple(comparisons))
+
+
+def _of_print(entry: PhotoEntry, scale: Scale) -> PhotoEntry:
+    """The photograph of a print of that scale: its distance was of a print of full size."""
+    size, pose = float(np.sqrt(scale.scale_x * scale.scale_y)), entry.pose
+    if pose and pose.distance_mm is not None and pose.distance_uncertainty_mm is not None:
+        far = {name: getattr(pose, name) * size for name in ("distance_mm", "distance_uncertainty_mm")}
+        pose = pose.changed(**far)
+    return entry.changed(scale=scale, pose=pose)
 
 
 def _sessions(grouping: Grouping, photos: Sequence[MeasuredPhoto], hits: dict[str, bool]) -> tuple[SessionCount, ...]:

@@ -3,7 +3,7 @@
 In: a file and what it names. Out: a part for each primitive and place, with the morph targets' weights in the file.
 Base colors and COLOR_0 are linear light and multiply, as the specification says. Refused: required extensions that are
 not read, and data shorter than declared. Left out on purpose: metal, roughness, emission, normal maps, transparency,
-skins and animation; `declarations` lists what is said of each.
+skins and animation; `declarations.csv` lists what is said of each.
 """
 
 import json
@@ -11,18 +11,18 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from patchproof.base.declarations import load_declarations
 from patchproof.base.errors import Refused
 from patchproof.base.input import MAX_FILE_BYTES
 from patchproof.base.validation import summarize_names
 from patchproof.mesh.assets import VERTEX_COLORS, WHITE, Assets, Wrap, draw_out_textures
-from patchproof.mesh.declarations import DECLARED
 from patchproof.mesh.mesh import MOST_FACES, Material, MeshPart, transform_part
 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
 _LEAST_FACES, _VERTICES_PER_FACE = 200, 100  # of what a placed part counts as
-_EXTENSIONS = {entry.declares: entry for entry in DECLARED if entry.file == "glTF extension"}
+_EXTENSIONS = {entry.declares: entry for entry in load_declarations("mesh") if entry.file == "glTF extension"}
 _LEFT_OUT = ("metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
 _IMAGE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")
 

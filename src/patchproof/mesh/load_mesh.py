@@ -1,9 +1,9 @@
 """Load a mesh by its name: a file, a procedural object (`primitives`), or a mesh given in Python; write one as GLB.
 
 In: a path of an OBJ (with MTL), GLB, glTF, PLY or STL file, `primitive:NAME` or `python:NAME`, and the object's longest
-extent. Out: a `Mesh` in the scene's frame, with warnings about what is not shown as declared (`declarations`). Refused:
-a file that cannot be parsed, and a missing or broken texture. Textures larger than any photograph shows are reduced. A
-mesh in memory goes through GLB, so that it equals what its run's folder will hold.
+extent. Out: a `Mesh` in the scene's frame, with warnings about what is not shown as declared (`declarations.csv`).
+Refused: a file that cannot be parsed, and a missing or broken texture. Textures larger than any photograph shows are
+reduced. A mesh in memory goes through GLB, so that it equals what its run's folder will hold.
 
 For other programs, trimesh writes glTF 2.0: in meters as its specification wants, y up, textures as lossless PNG
 inside, repeating. The same textures give the same bytes. Surfaces are matte and visible from both sides, as in the

@@ -82,15 +82,12 @@ class Operator:
         return self.compute(*(x if x is None else x.to(device) for x in data), *rest, **attributes)
 
 
-# --- products ---
+# --- products and normalization ---
 
 
 def _gemm(a, b, c=None, /, *, alpha=1.0, beta=1.0, transA=0, transB=0):
     a, b = a.mT if transA else a, b.mT if transB else b
     return alpha * (a @ b) if c is None else torch.addmm(c, a, b, beta=beta, alpha=alpha)
-
-
-# --- normalization ---
 
 
 def _batch_norm(x, scale, b, mean, variance, /, *, epsilon=1e-5, training_mode=0):

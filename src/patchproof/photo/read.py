@@ -1,7 +1,7 @@
 """Read a photograph as upright 8-bit sRGB pixels, with its focal length if the camera wrote one.
 
 In: any still picture that Pillow reads as one of `IMAGE_FORMATS` (HEIC with the `heic` extra). Out: `Photo`, or
-`PhotoRejected`, so that a bad file never stops a batch. `declarations` lists what files can declare: colors become
+`PhotoRejected`, so that a bad file never stops a batch. `declarations.csv` lists what files can declare: colors become
 sRGB, alpha is put on white, deeper channels become 8-bit. Pixels are converted in strips, since whole copies take twice
 the memory; above `WHOLE_PX` four pixels become one, since measuring takes up to 30 bytes each.
 JPEGs are decoded by OpenCV, strictly: what libjpeg warns of is damage. It fills that with gray or wrong blocks and says
@@ -40,10 +40,12 @@ if TYPE_CHECKING:
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
 _ORIENTATION, _XMP_ORIENTATION = 0x0112, re.compile(rb"tiff:Orientation\s*(?:=\s*[\"']|>)\s*([1-8])")
 _STRIP_PX = 250_000  # a megabyte: larger strips exceed the processor's cache, and take four times as long
+GONE_ADVICE = "the file is gone: copy it again"
 WHOLE_PX = 30_000_000  # few cameras except phones give more; markers are searched in 25 million at once
 _SKIPPED = (  # files that people copy together with photographs
     (".mov .mp4 .m4v .avi .mkv .webm .3gp .mts", "videos, which are not read (take still photographs)"),
     (".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .pef .srw", "raw files, which are not read (save them as JPEG)"),
+    (".zip .rar .7z .tar .gz .tgz", "archives, which are not read (unpack them)"),
     (".pdf .jxl .jp2 .psd", "files of other kinds, which are not read (save each page as JPEG or PNG)"),
 )
 _SKIPPED_KINDS = {suffix: kind for suffixes, kind in _SKIPPED for suffix in suffixes.split()}
@@ -83,7 +85,9 @@ def read_photo(path: str | Path) -> Photo:
     try:
         with limit_memory(MOST_BYTES):
             photo, orientation = run_limited(_decode, path)  # by now Pillow's picture has been freed
-            return replace(photo, srgb=_upright(photo.srgb, orientation))
+            down, right = ((1, 1), (1, -1), (-1, -1), (-1, 1))[(orientation - 1) % 4]  # of EXIF 2.32
+            pixels = photo.srgb.transpose(1, 0, 2) if orientation > 4 else photo.srgb
+            return replace(photo, srgb=np.ascontiguousarray(pixels[::down, ::right]))
     except PhotoRejected:
         raise
     except Exception as error:  # decoders fail in many ways: OSError, SyntaxError, struct.error...
@@ -92,7 +96,7 @@ def read_photo(path: str | Path) -> Photo:
             advice = "the picture takes too much memory: save it smaller"
             raise PhotoRejected("too_costly", None, None, advice) from error
         if kind == "FileNotFoundError":
-            advice = "the file is gone: copy it again"
+            advice = GONE_ADVICE
         elif kind == "UnidentifiedImageError":
             advice = f"{path.name} is not a picture of a known kind: save it as JPEG or PNG"
         elif isinstance(error, OSError) and error.errno:
@@ -118,12 +122,6 @@ def _decode(path: Path) -> tuple[Photo, int]:
         srgb, said = _decode_pixels(image, path, head, step)
         said = (*contradiction, *rest, *said)
         return Photo(srgb, focal_px and focal_px / step, spread, rejected, cropped, dpi, said), orientation
-
-
-def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """The pixels H×W×3 of a picture that is stored in one of the orientations 1 to 8 (EXIF 2.32)."""
-    down, right = ((1, 1), (1, -1), (-1, -1), (-1, 1))[(orientation - 1) % 4]
-    return np.ascontiguousarray((pixels.transpose(1, 0, 2) if orientation > 4 else pixels)[::down, ::right])
 
 
 def _orientation(image) -> tuple[int, tuple[str, ...]]:
@@ -193,7 +191,9 @@ def list_skipped_files(folder: Path, without: Path | None = None, depth: int = 1
                 skipped.append((printable(str(inside)), [_TOO_DEEP]))
             continue
         for path in paths:
-            if path.stem not in stems and (kind := _SKIPPED_KINDS.get(path.suffix.lower())):
+            if not Path(parent, path).exists():
+                skipped.append((printable(str(inside / path)), ["links to files that are not there"]))
+            elif path.stem not in stems and (kind := _SKIPPED_KINDS.get(path.suffix.lower())):
                 skipped.append((printable(str(inside / path)), [kind]))
     return summarize_said(skipped)
 

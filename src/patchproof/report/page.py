@@ -40,17 +40,13 @@ def _environment(folder: Path) -> "Environment":
     """The templates of a folder, each compiled once."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    options = {"trim_blocks": True, "lstrip_blocks": True, "undefined": StrictUndefined, "finalize": _printable_lines}
+    lines = lambda value: "\n".join(map(printable, value.split("\n"))) if type(value) is str else value  # noqa: E731  # markup is ours
+    options = {"trim_blocks": True, "lstrip_blocks": True, "undefined": StrictUndefined, "finalize": lines}
     environment = Environment(autoescape=True, loader=FileSystemLoader(folder), **options)
     environment.filters["percent"] = lambda share: "–" if share is None else f"{100 * share:.0f} %"
     environment.filters["figure"] = lambda value, digits=2: "not measured" if value is None else f"{value:.{digits}f}"
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
     return environment
-
-
-def _printable_lines(value: object) -> object:
-    """Make text `printable`, but for its line ends; what is markup is our own."""
-    return "\n".join(map(printable, value.split("\n"))) if type(value) is str else value
 
 
 def versions_of(libraries: Iterable[str]) -> dict[str, str]:

@@ -66,7 +66,7 @@ def report_html(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mappin
         verdict=words.VERDICTS[summary["verdict"]],
         steps=ledger_bars(summary["ledger"]) if summary["ledger"] else (),
         bands=rates_by_band(judged, primary, promise["conditions"]) if promise else (),
-        sized=any(photo["scale_x"] is not None for photo in photos),
+        scale=next(((p["scale_x"], p["scale_y"]) for p in photos if p["scale_x"] is not None), None),
         cards=cards,
         remarks=words.remarks(photos),
         times=Counter(text for photo in photos for text in (photo["advice"], *photo.get("said", ()))),
