@@ -118,6 +118,10 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     "load_classifier: a number": (lambda: pp.load_classifier(3), "name of load_classifier"),
     "load_classifier: a device": (lambda: pp.load_classifier(NET, device="gpu"), "a device that this torch can use"),
     "photograph: channels last": (lambda: photograph(torch.zeros(8, 8, 3)), "got torch.float32 8×8×3"),
+    "photograph: bytes": (lambda: photograph(torch.zeros(3, 8, 8, dtype=torch.uint8)), "got torch.uint8 3×8×8"),
+    "photograph: codes": (lambda: photograph(torch.full((3, 8, 8), 255.0)), r"in \[0, 1\], got torch.float32"),
+    "photograph: not a number": (lambda: photograph(torch.full((3, 8, 8), torch.nan)), r"in \[0, 1\]"),
+    "photograph: nothing": (lambda: photograph(torch.zeros(3, 0, 8)), "got torch.float32 3×0×8"),
     "photograph: floats": (lambda: photograph(np.zeros((8, 8, 3))), "got float64 8×8×3"),
     "photograph: one side": (
         lambda: photograph(RUN.design, size_px=72),
@@ -147,6 +151,11 @@ def test_a_mistake_is_refused_in_one_sentence(mistake, tmp_path, monkeypatch):
     assert sentence.startswith("Expected ") and ", got " in sentence and sentence.endswith(".") and "\n" not in sentence
     assert len(sentence) < 500 and "--" not in sentence and " at 0x" not in sentence
     assert len(MISTAKES) >= 60 and sorted(path.name for path in tmp_path.iterdir()) == ["there.pdf"]
+
+
+def test_a_design_in_float64_is_one_in_float32():
+    design = torch.rand(3, 8, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(photograph(design), photograph(design.float()))
 
 
 def test_numbers_of_numpy_are_numbers():

@@ -1,5 +1,9 @@
-"""Entry point of `python -m patchlab`."""
+"""Entry point of the laboratory's command line, also as `python -m patchlab`."""
 
-from patchlab.cli import main
+from functools import partial
 
-main()
+from patchproof.__main__ import main as run
+
+main = partial(run, "patchlab.cli")
+if __name__ == "__main__":
+    main()

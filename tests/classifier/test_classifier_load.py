@@ -255,12 +255,14 @@ def test_own_code_beside_the_scene_gives_a_network_or_a_classifier(tmp_path):
         ("own_networks_b.fails", r"OSError \(no weights here\): fix the factory"),
         ("own_networks_b.absent", "a function absent in own_networks_b, got none"),
         ("not_there.factory", "an import that fails.*put it beside the scene file"),
+        ("own_broken.factory", r"own_broken.*an import that fails \(name 'j' is not defined\): correct its code"),
         ("own_networks_b", "name a module and a function in it"),
         ("os.path;x.y", "name a module and a function in it"),
     ],
 )
 def test_own_code_that_is_not_as_said_is_refused(name, sentence, tmp_path, monkeypatch):
     (tmp_path / "own_networks_b.py").write_text(OWN)
+    (tmp_path / "own_broken.py").write_text("j")
     monkeypatch.delitem(sys.modules, "own_networks_b", raising=False)
     with pytest.raises(Refused, match=sentence):
         load_classifier(f"module:{name}", tmp_path)

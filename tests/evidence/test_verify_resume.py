@@ -11,11 +11,12 @@ from concurrent.futures import Future
 from multiprocessing import get_context
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from synthetic_photos import make_manifest, save
 
-from patchproof.app.verify import verify
+from patchproof.app.verify import CaptureInfo, verify
 from patchproof.base.errors import Refused, WorkerDied
 from patchproof.base.workers import can_fork
 from patchproof.channel.printer import identity_printer
@@ -25,7 +26,8 @@ from patchproof.evidence.batch import FinishedPhoto, Journal, file_sha256
 from patchproof.evidence.gather import gather_evidence
 from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.task import Options, task_of
-from patchproof.photo.read import read_photo
+from patchproof.photo.read import HEIC_ADVICE, read_photo
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import dump_manifest
 from test_verify_run import NET, promise, shot
 
@@ -202,6 +204,39 @@ def test_a_folder_of_somebody_else_is_not_resumed(folder, sheet, tmp_path):
     with pytest.raises(Refused, match=r"thesis\.txt"):
         verify(folder, sheet, tmp_path, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_resolution_that_no_scan_has_and_empty_arrays_are_refused(folder, sheet, tmp_path):
+    with pytest.raises(Refused, match="from 30 to 4800 dpi, got 0: correct"):
+        verify(folder, sheet, tmp_path / "out", capture=CaptureInfo(scan_dpi=0))
+    with pytest.raises(Refused, match=r"got uint8 \(0, 0, 3\) at index 0"):
+        verify([np.zeros((0, 0, 3), np.uint8)], sheet, tmp_path / "out")
+
+
+def test_a_report_of_another_sheet_is_not_resumed(folder, sheet, tmp_path):
+    verify(folder, sheet, tmp_path / "out", ledger_photos=0)
+    before = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*.*")}
+    other = json.loads(sheet.read_text())
+    (tmp_path / "other.json").write_text(json.dumps(other | {"sheet_id": other["sheet_id"][::-1]}))
+    with pytest.raises(Refused, match=rf"Expected the sheet {other['sheet_id']} of the report in .*out, got "):
+        verify(folder, tmp_path / "other.json", tmp_path / "out", resume=True, ledger_photos=0)
+    assert {p: p.read_bytes() for p in (tmp_path / "out").rglob("*.*")} == before
+
+
+def test_photographs_of_a_kind_whose_library_is_missing_are_read_again(tmp_path, folder, monkeypatch):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "b0.heic").write_bytes((folder / "b0.jpg").read_bytes())
+
+    def refuse(path):
+        raise PhotoRejected("unreadable", None, None, HEIC_ADVICE)
+
+    found = []
+    for read in (refuse, lambda path: read_photo(folder / "b0.jpg")):
+        monkeypatch.setattr(batch, "read_photo", read)
+        options = Options([NET], identity_printer(), ledger_photos=0)
+        kept = dict(journal=tmp_path / "photos.jsonl", resume=True)
+        found.append(gather_evidence(tmp_path / "photos", make_manifest(promise()), options, **kept).summary.judged)
+    assert found == [0, 1]
 
 
 def test_a_received_report_is_not_resumed_through_links_or_over_photographs(folder, sheet, tmp_path):

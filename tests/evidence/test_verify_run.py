@@ -125,15 +125,17 @@ def test_another_design_and_a_print_without_an_ink_do_not_count(printed, code):
     assert photo.entry.remark.figure < photo.entry.remark.threshold
 
 
-def test_gray_prints_and_photographs_of_a_design_in_two_inks_do_not_count():
+def test_gray_and_swapped_colors_of_a_design_in_two_inks_do_not_count():
     """Such a design tells no ink from another, but color from none."""
     share = np.random.default_rng(4).random((14, 14, 2)).repeat(10, 0).repeat(10, 1)
     design = (255 - share[..., :1] * [220, 60, 20] - share[..., 1:] * [20, 130, 60]).clip(0, 255).astype(np.uint8)
     gray = np.repeat(design.mean(-1, keepdims=True), 3, -1).astype(np.uint8)
-    for printed, code in ((design, None), (gray, "wrong_ink")):
+    for printed, swap, said in ((design, 1, None), (gray, 1, "are gray"), (design, -1, "red and blue are swapped")):
         page = page_raster(make_manifest(design=np.ascontiguousarray(printed)), True)
         photo = photograph(page, view(10, 5, 550, size_px=(800, 600)), (800, 600), blur_px=0.5, fine=2)
-        assert measured(photo, manifest=make_manifest(design=design)).entry.code == code
+        photo = np.ascontiguousarray(photo[..., ::swap])
+        entry = measured(photo, manifest=make_manifest(design=design)).entry
+        assert entry.code == (said and "wrong_ink") and (said is None or said in entry.remark.advice)
 
 
 def test_a_design_of_one_color_is_told_from_others_by_structure_ink_and_color():
@@ -527,6 +529,8 @@ def test_rulers_tell_the_size_and_only_a_possible_one(few, mm, scale):
     assert all(photo.scale.scale_x == pytest.approx(scale) for photo in report.photos)
     with pytest.raises(Refused, match=r"lengths of about 100 and 100 mm, as printed, got 9\.7 and 9\.7 mm"):
         verified(few, ruler_mm=(9.7, 9.7))
+    with pytest.raises(Refused, match="got 0 and 97 mm"):
+        verified(few, ruler_mm=(0, 97))
 
 
 def test_a_control_s_sheet_under_another_control_s_name_does_not_count(few, tmp_path):

@@ -236,9 +236,9 @@ def test_a_report_of_other_photographs_in_the_same_folder_is_a_look(tmp_path, ea
     content = {"sheet_id": manifest.sheet_id, "summary": {"looks": earlier}, "photos": [{"sha256": "a"}]}
     if earlier is not None:
         (tmp_path / "report.json").write_text(json.dumps(content))
-    assert _look_at(tmp_path, manifest)([entry]) == Look(number)
+    assert _look_at(tmp_path, manifest, False)([entry]) == Look(number)
     (tmp_path / "report.json").write_text(json.dumps(content | {"sheet_id": "other"}))
-    assert _look_at(tmp_path, manifest)([entry]) == Look(1)
+    assert _look_at(tmp_path, manifest, False)([entry]) == Look(1)
 
 
 def test_photographs_that_were_watched_have_a_look_for_each_session():

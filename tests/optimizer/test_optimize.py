@@ -516,6 +516,9 @@ def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views, mo
     promised = promise_run(tmp_path / "draft", trust=True)
     assert same_files(tmp_path / "whole", tmp_path / "draft", ("run.json",)) and not promised.promise.draft
     assert load_run(tmp_path / "draft").promise == promised.promise
+    resumed = optimize_scene(scene, tmp_path / "draft", promise=PromiseOptions(views=8), resume=True)
+    assert resumed.promise == promised.promise, "a fuller one is kept"
+    assert same_files(tmp_path / "whole", tmp_path / "draft", ("run.json",))
     with pytest.raises(Refused, match="a promise of 8 views"):
         promise_run(tmp_path / "draft", views=4, trust=True)
     for use in (promise_run, evaluate):

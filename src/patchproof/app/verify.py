@@ -20,6 +20,7 @@ from patchproof.base.folder_lock import lock_folder
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file, read_json
 from patchproof.base.progress import Compute, Progress, no_progress
+from patchproof.base.text import printable
 from patchproof.base.validation import refuse_untrusted
 from patchproof.channel.printer import load_printer, printer_of_sheet
 from patchproof.classifier.load import load_classifier
@@ -38,6 +39,7 @@ from patchproof.sheets.manifest import Manifest, load_manifest
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
 
+_SCAN_DPI = 30, 4800  # as on the command line
 _PHOTOS = "photos"
 REPORT_FILES = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _PHOTOS, JOURNAL_FILE)
 _LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
@@ -111,10 +113,13 @@ def verify(
     out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     if not (manifest.markers or capture.find or capture.corners):
         raise Refused("--find or --corners FILE for a print without markers", "neither", "add one of them")
+    low, high = _SCAN_DPI
+    if capture.scan_dpi is not None and not low <= capture.scan_dpi <= high:
+        raise Refused(f"a scan's resolution from {low} to {high} dpi", f"{capture.scan_dpi}", "correct scan_dpi")
     with lock_folder(out):
         files = {"camera": capture.camera, "boxes": capture.boxes, "corners": capture.corners}
         _check_out(out, resume, overwrite, (photos, sheet, controls, *files.values()))
-        look_at = _look_at(out, manifest)
+        look_at = _look_at(out, manifest, resume)
         if isinstance(photos, str | Path) and is_file(Path(photos) / JOURNAL_FILE):
             look_at = lambda entries: None  # noqa: E731  # `capture` showed the answers while they were taken
         options = options_of(sheet, manifest, models, capture.camera, trust)
@@ -194,16 +199,22 @@ def options_of(
     return Options(classifiers, printer, load_camera(camera))
 
 
-def _look_at(out: Path, manifest: Manifest) -> Callable[[Sequence[PhotoEntry]], Look]:
+def _look_at(out: Path, manifest: Manifest, resume: bool) -> Callable[[Sequence[PhotoEntry]], Look]:
     """Return a function that numbers this look at photographs: as the report of this sheet in `out` does if its
-    photographs were the same, one more if they were others, 1 without such a report.
+    photographs were the same, one more if they were others, 1 without such a report. One of another sheet is not
+    resumed.
     """
+    sheet_id = manifest.sheet_id
     try:
         report = read_json(out / "report.json", "a report", "verify again")
+        sheet_id = str(report["sheet_id"])
         number, hashes = int(report["summary"]["looks"]), {photo["sha256"] for photo in report["photos"]}
-        earlier = min(max(number, 1), 1000) if report["sheet_id"] == manifest.sheet_id else 0
+        earlier = min(max(number, 1), 1000) if sheet_id == manifest.sheet_id else 0
     except (Refused, LookupError, TypeError, ValueError, OverflowError):
         earlier, hashes = 0, set()
+    if resume and sheet_id != manifest.sheet_id:
+        expected, got = f"the sheet {printable(sheet_id)} of the report in {out}", manifest.sheet_id
+        raise Refused(expected, got, "name that sheet, or another --out")
     return lambda entries: Look(earlier + (earlier == 0 or {entry.sha256 for entry in entries} != hashes))
 
 

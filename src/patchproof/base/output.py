@@ -248,7 +248,7 @@ def write_pictures(pictures: Sequence[np.ndarray], folder: Path) -> Path:
     if not len(pictures):
         raise Refused("a folder of photographs or arrays", "an empty list", "give one array or more")
     for number, array in enumerate(pictures):
-        if not isinstance(array, np.ndarray) or array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
+        if not isinstance(array, np.ndarray) or array.dtype != np.uint8 or array.shape[2:] != (3,) or not array.size:
             got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else f"a {type(array).__name__}"
             raise Refused("photographs as uint8 H×W×3 arrays", f"{got} at index {number}", "convert it to 8-bit RGB")
     with new_folder(folder, ("photo_*.png",), overwrite=True) as part:

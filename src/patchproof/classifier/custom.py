@@ -137,7 +137,8 @@ def _factory(dotted: str, base: Path):
     try:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # SyntaxError and the like in the user's module too
-        do = "install it, or put it beside the scene file"
+        is_missing = isinstance(error, ModuleNotFoundError)
+        do = "install it, or put it beside the scene file" if is_missing else "correct its code"
         raise Refused(f"the module {module_name} of module:{dotted}", f"an import that fails ({error})", do) from error
     finally:
         sys.path.pop()

@@ -44,6 +44,7 @@ _CODE_ERROR = 0.8  # of a cell, by rounding and JPEG: from 2 to 5 stops too dark
 _LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # multiplies white noise by 6
 LEAST_FOUND = 0.35  # of the cells with detail, in their places: other designs show 0.33 at most, its own prints 0.8
 LEAST_LIKENESS = 0.6  # correlation of structure
+_SWAPPED_BY = 0.3  # of hues' correlation: red and blue swapped beside as they are
 LEAST_INK, WEAK_INK = (
     0.2,
     0.3,
@@ -59,6 +60,7 @@ _INKS = ("cyan", "magenta", "yellow")
 _OTHER_ADVICE = "this is another design than the sheet's: name that design's JSON, or print this sheet"
 _INK_ADVICE = "{} ink is missing or wrong, or the print is gray: check the printer's inks and nozzles and print again"
 _GRAY_ADVICE = "print or photograph are gray: switch black and white off, in the printer's settings and the camera's"
+_SWAPPED_ADVICE = "red and blue are swapped: give RGB, such as array[..., ::-1] of what OpenCV reads"
 _WEAK_ADVICE = "{} ink is weak in this print: it counts, but check the printer's nozzles before you print more"
 _UNTOLD_ADVICE = "too little of the design is resolved to tell it from another: come closer"
 
@@ -245,6 +247,10 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
         return DesignMatch(likeness)
     own, found = (np.linalg.svd(colors, compute_uv=False) for colors in (x, x @ gains))
     chroma = float(found[1] * own[0] / max(found[0] * own[1], 1e-9))
+    hues, *seen_hues = (v - v.mean(1, keepdims=True) for v in (x, y, y[:, ::-1]))
+    alike, swapped = (float(np.corrcoef(hues.ravel(), each.ravel())[0, 1]) for each in seen_hues)
+    if own[1] > _LEAST_CHROMA * own[0] and swapped > LEAST_LIKENESS > alike + _SWAPPED_BY:
+        return DesignMatch(likeness, PhotoRejected("wrong_ink", alike, LEAST_LIKENESS, _SWAPPED_ADVICE))
     if own[1] > _LEAST_CHROMA * own[0] and chroma < LEAST_INK:
         return DesignMatch(likeness, PhotoRejected("wrong_ink", chroma, LEAST_INK, _GRAY_ADVICE))
     if own[2] < _LEAST_COLORFUL * own[0]:  # a design in gray or two inks tells no contrasts: compare its two colors

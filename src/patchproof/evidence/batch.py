@@ -46,7 +46,7 @@ from patchproof.photo import detect
 from patchproof.photo.exif import has_camera_shape, time_and_camera
 from patchproof.photo.limits import MOST_BYTES, run_limited
 from patchproof.photo.quality import FrameLight, is_featureless
-from patchproof.photo.read import GONE_ADVICE, read_photo
+from patchproof.photo.read import GONE_ADVICE, HEIC_ADVICE, read_photo
 from patchproof.photo.registration import DesignCorners
 from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest
@@ -227,7 +227,7 @@ def measure_all(
         if item.control is None:
             on_pictures(item.file, measured.pictures)
         finished = FinishedPhoto.of(replace(measured, entry=entry), item.with_pictures)
-        if journal is not None:
+        if journal is not None and not (entry.remark and entry.remark.advice == HEIC_ADVICE):  # it may be installed
             journal.add(item.journal_name, sha256, finished)
         photos[number] = finished.photo
         step(len(photos), len(items))

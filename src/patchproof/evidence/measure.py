@@ -291,7 +291,7 @@ def ruler_scale(measured_mm: tuple[float, float], printed_mm: tuple[float, float
     """The print's scale by its rulers as somebody measured them; refused if no print of this page has it."""
     x, y = (measured / printed for measured, printed in zip(measured_mm, printed_mm, strict=True))
     scale = Scale(scale_x=x, scale_y=y)
-    if not _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1]:
+    if min(x, y) <= 0 or not _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1]:
         expected = "lengths of about {:g} and {:g} mm, as printed".format(*printed_mm)
         raise Refused(expected, "{:g} and {:g} mm".format(*measured_mm), "measure both of them in millimeters")
     if abs(_worst(scale) - 1) > MOST_SCALE_ERROR:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
 _ORIENTATION, _XMP_ORIENTATION = 0x0112, re.compile(rb"tiff:Orientation\s*(?:=\s*[\"']|>)\s*([1-8])")
 _STRIP_PX = 250_000  # a megabyte: larger strips exceed the processor's cache, and take four times as long
+HEIC_ADVICE = "HEIC needs pillow-heif: pip install 'patchproof[heic]', or save the photo as JPEG"
 GONE_ADVICE = "the file is gone: copy it again"
 WHOLE_PX = 30_000_000  # few cameras except phones give more; markers are searched in 25 million at once
 _SKIPPED = (  # files that people copy together with photographs
@@ -213,8 +214,7 @@ def allow_heic(path: Path) -> None:
         try:
             import pillow_heif  # type: ignore[reportMissingImports]  # an extra
         except ImportError:
-            advice = "HEIC needs pillow-heif: pip install 'patchproof[heic]', or save the photo as JPEG"
-            raise PhotoRejected("unreadable", None, None, advice) from None
+            raise PhotoRejected("unreadable", None, None, HEIC_ADVICE) from None
         pillow_heif.register_heif_opener()
 
 

@@ -35,6 +35,7 @@ from patchproof.scene.placement import SurfaceFrame
 
 DISTANCE_LENGTHS = 60.0  # of a plan's camera, over the object's length
 PAPER_BACK_LINEAR = 0.8  # reflectance of plain white card, for a piece seen from behind
+_ROUNDING = 0.01  # of a design's values beyond 0 and 1
 _OUTLINE_REACH_PX = 1  # outlines mix neighboring pixels
 MeshSceneType = TypeVar("MeshSceneType", bound=MeshScene)
 _PICTURE_GRAIN_SEED = 1 << 40  # added to the seed: the base photograph's grain is not that of the simulated camera
@@ -57,13 +58,13 @@ def photograph(
         raise Refused("size_px of 1 pixel at least", f"{size_px}", "give (width, height)")
     if isinstance(shown, np.ndarray | Tensor):
         is_pixels = isinstance(shown, np.ndarray)
-        if shown.ndim != 3 or shown.shape[-1 if is_pixels else 0] != 3 or (is_pixels and shown.dtype != np.uint8):
+        right = shown.ndim == 3 and shown.shape[-1 if is_pixels else 0] == 3 and min(shown.shape) > 0
+        right &= shown.dtype == np.uint8 if is_pixels else shown.is_floating_point()
+        if not right or not (is_pixels or (shown.min() >= -_ROUNDING and shown.max() <= 1 + _ROUNDING)):  # also NaN
             expected = "a design as uint8 pixels h×w×3, or as a float tensor 3×h×w in [0, 1]"
             raise Refused(expected, brief(shown), "convert it")
-    if isinstance(shown, np.ndarray):
-        shown = torch.tensor(shown, dtype=torch.float32, device=stage.device).permute(2, 0, 1) / 255
-    if isinstance(shown, Tensor):
-        shown = stage.design_renderer.appearance(shown)
+        pixels = torch.tensor(shown, device=stage.device).permute(2, 0, 1) / 255 if is_pixels else shown.float()
+        shown = stage.design_renderer.appearance(pixels)
     return expose(render_views(stage, shown, conditions, size_px), shown, jpeg)
 
 

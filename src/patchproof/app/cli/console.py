@@ -117,7 +117,9 @@ def run_command_line(app: Typer) -> None:
         if isinstance(error, Refused):
             sentence = str(error)
         elif disk_is_full(error):
-            sentence = "Expected room on the disk, got none left: make room, then run the command again."
+            sentence = (
+                "Expected room on the disk, got none left: make room, then go on, with --resume where there is one."
+            )
         elif isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
             sentence = "Expected enough memory, got none left: give it more, fewer --jobs, or smaller files."
         elif isinstance(error, OSError):
