@@ -202,6 +202,9 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
     )
     summary = report.summary
     assert (state["verdict"], state["reason"]) == (summary.verdict, summary.reason)
+    assert ("may say otherwise" in state["effect"]) == (
+        summary.worth is not None and summary.worth.source == "simulated"
+    )
     recognized = sum(session["recognized"] for session in state["sessions"])
     assert state["judged"] == summary.judged == SHOTS - 1 == recognized + 1  # the dark one
     assert recognized == round(summary.rate * summary.judged)

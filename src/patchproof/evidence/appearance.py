@@ -45,10 +45,7 @@ _LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # mul
 LEAST_FOUND = 0.35  # of the cells with detail, in their places: other designs show 0.33 at most, its own prints 0.8
 LEAST_LIKENESS = 0.6  # correlation of structure
 _SWAPPED_BY = 0.3  # of hues' correlation: red and blue swapped beside as they are
-LEAST_INK, WEAK_INK = (
-    0.2,
-    0.3,
-)  # contrast: of the strongest ink's; chroma of the promised: real prints keep 0.4, gray 0.04
+LEAST_INK, WEAK_INK = 0.2, 0.3  # contrast: of the strongest ink's; of chroma real prints keep 0.4, gray ones 0.04
 _LEAST_PLAIN_INK = 0.55  # the same of grays without structure, by the light absorbed: real prints have 0.65 and more
 _MOST_COLOR = 36.0  # ΔE00 of one color: 177 of real prints are off by 27 at most from `office`, by 35 from `coated`
 _LEAST_CELLS, _LEAST_DETAILED = 40, 6

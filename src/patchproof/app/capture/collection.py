@@ -39,6 +39,7 @@ from patchproof.report.words import VERDICTS, benefit_sentence, headline_of
 from patchproof.sheets.manifest import ConditionClaim, Manifest
 
 _CORNER_CODES = ("no_corners", "other_design", "several_sheets")  # of photographs in which a person may tap corners
+_OF_REPORT = " A report renders controls into the photographs themselves, and may say otherwise: patchproof verify."
 _LATEST_PHOTOS = 12  # that are listed with advice
 _USUAL_SESSIONS = 4  # on the map, if no number of sessions would prove the promise
 _ROWS, _MOST_COLUMNS = 3, 5
@@ -168,11 +169,12 @@ def state_of(collection: PhotoCollection, sessions: int | None) -> dict[str, Any
     counted = [photo.entry for path, photo in photos.items() if photo.counted and collection.control_of(path) is None]
     wanted = PHOTOS_PER_SESSION * (sessions or _USUAL_SESSIONS)
     names = sorted(photos, key=lambda path: path.name)  # in the order of arrival
+    simulated = summary.worth is not None and summary.worth.source == "simulated"
     return {
         "verdict": summary.verdict,
         "headline": VERDICTS[summary.verdict],
         "reason": summary.reason,
-        "effect": f"{headline_of(data)}. {benefit_sentence(data)}",
+        "effect": f"{headline_of(data)}. {benefit_sentence(data)}{_OF_REPORT if simulated else ''}",
         "photos": summary.photos,
         "judged": summary.judged,
         "sessions": rows,

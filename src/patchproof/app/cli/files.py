@@ -43,7 +43,8 @@ def _check_scene(path: Path) -> None:
 
 
 _CHECKS: Mapping[str, Callable[[Path], object]] = {
-    **{name: partial(require_path, f"a file for --{name}") for name in ("icc", "corners", "boxes", "controls")},
+    **{name: partial(require_path, f"a file for --{name}") for name in ("icc", "corners", "boxes")},
+    "controls": partial(require_path, "a folder of control photographs"),
     **{"run": require_finished_run, "runs": require_finished_run, "sheet": load_manifest},
     **{"pdf": partial(require_path, "a sheet's PDF"), "picture": partial(require_path, "a picture")},
     "photos": partial(require_path, "a folder of photographs"),
