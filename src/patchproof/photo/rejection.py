@@ -26,7 +26,7 @@ REJECTION_CODES = {
     "cropped": ("an undeclared crop moved the picture's center", "use the photograph as the camera wrote it"),
     "copy": ("another file shows the same photograph", "leave one of them"),
     "other_design": ("what is printed is not this design", "name the sheet that was printed"),
-    "wrong_ink": ("an ink is missing or another one", "print again with all inks"),
+    "wrong_ink": ("an ink or all color is missing, or red and blue are swapped", "print and photograph in color"),
     "no_corners": ("a print without markers was not found", "add --find or --corners"),
 }
 MIRRORED_ADVICE = "the photo is mirrored: switch off the camera's mirror setting and save it again"
