@@ -207,5 +207,12 @@ def test_a_folder_without_boards_is_refused(tmp_path):
     Image.fromarray(np.full((480, 640, 3), 90, np.uint8)).save(tmp_path / "a.png")
     with pytest.raises(Refused, match="Expected photographs of the board"):
         find_boards(tmp_path, BOARD)
+    none = tmp_path / "none"
+    none.mkdir()
+    Image.fromarray(np.full((480, 640, 3), 90, np.uint8)).save(none / "gray.png")
+    with pytest.raises(
+        Refused, match=r"got 1 that do not show it \(gray\.png: .+\): take them sharp and lit, not mirrored"
+    ):
+        calibrate_camera(none, "charuco_a4", tmp_path / "camera.json")
     with pytest.raises(Refused, match=r"ends in \.json"):
         calibrate_camera(tmp_path, "charuco_a4", tmp_path / "camera.txt")

@@ -302,8 +302,10 @@ def test_a_page_without_markers_keeps_its_cut_its_rulers_and_the_design_s_pixels
     with_markers = write_sheet(tmp_path / "m.pdf", load_template("a4"), replace(content, piece=scene.piece))
     assert manifest.markers == () and with_markers.markers and with_markers.cut_mm == manifest.cut_mm
     assert (manifest.design.pixels() == design_of(0)).all(), "none is white for a marker"
-    with closing(PdfDocument(tmp_path / "b.pdf")) as pdf:
-        assert "100" in pdf[0].get_textpage().get_text_range(), "the rulers' digits"
+    for name, keeps in (("b.pdf", False), ("m.pdf", True)):
+        with closing(PdfDocument(tmp_path / name)) as pdf:
+            text = pdf[0].get_textpage().get_text_range()
+        assert "100" in text and ("Keep the squares" in text) == keeps, "the rulers' digits, and what to keep"
     for template, message in (("a4_tiles", "markers on a piece in tiles"), ("none", "a print of 5 mm to 20 m")):
         with pytest.raises(Refused, match=message):
             refuse_larger_than_page(page_template(template), replace(bare.piece, size_mm=(4.0, 250.0)))

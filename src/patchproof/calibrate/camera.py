@@ -148,8 +148,9 @@ def find_boards(
             left_out[path.name] = rejection.advice
         advance(number, len(paths))
     if not views:
-        got = f"{len(paths)} photographs that do not show it"
-        raise Refused(f"photographs of the board {board.sheet_id}", got, "name the board with --board")
+        got = f"{len(paths)} that do not show it ({': '.join(next(iter(left_out.items())))})"
+        do = "take them sharp and lit, not mirrored, or name the board with --board"
+        raise Refused(f"photographs of the board {board.sheet_id}", got, do)
     common = Counter(states).most_common(1)[0][0]
     pairs = list(zip(views, states, strict=True))
     left_out |= {view.file: _other_state(state, common) for view, state in pairs if state != common}

@@ -23,6 +23,7 @@ from patchproof.sheets.template import AnyTemplate, Template, TextLine
 SIZE_MM = 0.95  # font size
 _CAPS_MM = SIZE_MM * CAP_HEIGHT
 _ABOVE_MM = (SCISSORS_MM - _CAPS_MM) / 2  # capitals, and below them
+KEEP_MARKERS = " Keep the squares in their white corners: they are part of the piece."
 _INSET_MM = 0.4  # from the sides of the white: ten of the widest letters still fit beside an 8 mm marker
 _ARROW_MM = 0.9  # width of the arrow and the space after it
 
@@ -67,7 +68,8 @@ class SheetContent:
         if self.promise is not None and self.promise.draft:
             kind = f"draft {kind}"
         fix = "Wrap the piece smoothly round the object" if self.bent else "Fix the piece flat on the object"
-        return {"sheet_id": self.sheet_id, "kind": kind, "design": size, "piece": size, "fix": fix}
+        keep = KEEP_MARKERS if self.piece.markers else ""
+        return {"sheet_id": self.sheet_id, "kind": kind, "design": size, "piece": size, "fix": fix, "keep": keep}
 
     def pictures(self, rect_mm: RectMm) -> tuple[tuple[RectMm, np.ndarray], ...]:
         """The design at `rect_mm` as the pictures of a page; none for white paper."""

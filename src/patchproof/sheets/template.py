@@ -77,7 +77,7 @@ class TileGrid(StrictModel):
 
 
 class TextLine(StrictModel):
-    """One line of text; {sheet_id}, {kind}, {design}, {piece} and {fix} are replaced by their values."""
+    """One line of text; {sheet_id}, {kind}, {design}, {piece}, {fix} and {keep} are replaced by their values."""
 
     at_mm: PagePoint  # left end of its baseline
     size_mm: Positive  # font size

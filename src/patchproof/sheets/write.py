@@ -19,7 +19,7 @@ from pathlib import Path
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import write_atomically, write_files_atomically
-from patchproof.sheets.content import SheetContent, page_manifest, piece_words
+from patchproof.sheets.content import KEEP_MARKERS, SheetContent, page_manifest, piece_words
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, design_sha256, dump_manifest
 from patchproof.sheets.page import lay_out_page, lay_out_parts, piece_name, place_pieces
@@ -87,8 +87,9 @@ def write_several(
     labels = [piece_words(design, pieces[i][1], piece_name(i)) for i, design in enumerate(designs)]
     sizes = " and ".join(sorted({size_text(design.piece.size_mm) for design in designs}))
     fix = "Put each piece on its object as its own plan page shows"
-    words = {"sheet_id": identity, "kind": f"{len(designs)} designs", "design": sizes, "piece": sizes, "fix": fix}
     used = {marker.id for design in designs for marker in design.piece.markers}
+    words = {"sheet_id": identity, "kind": f"{len(designs)} designs", "design": sizes, "piece": sizes, "fix": fix}
+    words["keep"] = KEEP_MARKERS if used else ""
     free = (i for i in hash_order(" ".join(design.sheet_id for design in designs), 1000) if i not in used)
     page_ids = list(islice(free, len(template.marker.corners_mm))) if used else []
     page = lay_out_parts(template, pieces, page_ids, code, words, labels)

@@ -157,5 +157,5 @@ def _suffix_of(head: bytes) -> str:
     for suffix, (start, beginnings) in _KINDS.items():
         if head.startswith(beginnings, start) and (suffix != ".webp" or head.startswith(b"RIFF")):
             return suffix
-    got = f"a file that begins with the bytes {head.hex(' ')}"
+    got = f"a file that begins with the bytes {head.hex(' ')}" if head else "an empty file"
     raise UploadRefused(415, "a photograph (JPEG, PNG, WebP, HEIC or AVIF)", got, "take it again")
