@@ -254,6 +254,7 @@ def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_
         assert command("verify", tmp_path / "photo", *arguments) == 0
     (typed,) = json.loads((tmp_path / "ruler" / "report.json").read_text())["photos"]
     assert (typed["scale_x"], typed["scale_y"]) == pytest.approx((0.971, 0.973))
+    assert "The print has 0.971 × 0.973 of its size" in (tmp_path / "ruler" / "report.html").read_text("utf-8")
 
 
 def test_control_photographs_test_the_effect(report, again):

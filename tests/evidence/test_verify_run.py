@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import os
 from contextlib import nullcontext
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -501,6 +503,19 @@ def test_a_photograph_that_only_workers_miss_ends_the_run_and_is_not_kept(few, t
     with pytest.raises(Refused, match=r"cluster's machines, too, got none at /.*a\.JPG: let all its"):
         gather_evidence(few, make_manifest(promise()), Options([NET], identity_printer()), journal=journal)
     assert "b0.jpg" not in journal.read_text()
+
+
+def test_workers_get_whole_paths(few, tmp_path, monkeypatch):
+    """Those of a cluster may stand in another folder."""
+    (tmp_path / "mean").mkdir()
+    (tmp_path / "mean" / "a.jpg").write_bytes((few / "b0.jpg").read_bytes())
+    monkeypatch.chdir(few.parent)
+    given, measure_all = [], gather.measure_all
+    monkeypatch.setattr(
+        gather, "measure_all", lambda task, items, *rest: given.extend(items) or measure_all(task, items, *rest)
+    )
+    verified(Path(few.name), controls=Path(os.path.relpath(tmp_path)))
+    assert len(given) == 4 and all(item.path.is_absolute() for item in given)
 
 
 def test_without_its_workers_no_journal_is_begun(few, tmp_path, monkeypatch):
