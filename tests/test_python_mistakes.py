@@ -120,6 +120,7 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     "photograph: channels last": (lambda: photograph(torch.zeros(8, 8, 3)), "got torch.float32 8×8×3"),
     "photograph: bytes": (lambda: photograph(torch.zeros(3, 8, 8, dtype=torch.uint8)), "got torch.uint8 3×8×8"),
     "photograph: codes": (lambda: photograph(torch.full((3, 8, 8), 255.0)), r"in \[0, 1\], got torch.float32"),
+    "photograph: negative": (lambda: photograph(torch.full((3, 8, 8), -1.0)), r"in \[0, 1\], got torch.float32"),
     "photograph: not a number": (lambda: photograph(torch.full((3, 8, 8), torch.nan)), r"in \[0, 1\]"),
     "photograph: nothing": (lambda: photograph(torch.zeros(3, 0, 8)), "got torch.float32 3×0×8"),
     "photograph: floats": (lambda: photograph(np.zeros((8, 8, 3))), "got float64 8×8×3"),

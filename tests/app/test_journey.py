@@ -247,6 +247,7 @@ def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_
     (photo,) = scanned["photos"]
     assert photo["scale_x"] == pytest.approx(0.97, abs=0.003) and photo["scale_y"] == pytest.approx(0.97, abs=0.003)
     assert photo["code"] == "scale_off" and scanned["summary"]["rate"] is None
+    assert not any("uncut" in each for each in scanned["summary"]["left_out"]), "it is a scan, which says so itself"
     (tmp_path / "photo").mkdir()
     shutil.copy(journey / "photos" / "photo_0001.jpg", tmp_path / "photo")
     arguments = ("--sheet", sheet, "--out", tmp_path / "ruler", "--ruler-mm", "97.1x97.3", "--ledger", 0)
