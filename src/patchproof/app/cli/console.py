@@ -26,7 +26,9 @@ Resume = Annotated[bool, Option("--resume", help="Continue a stopped run.")]
 Jobs = Annotated[
     int | None, Option(min=1, help="Local processes, one for each free core; any number gives the same results.")
 ]
-Cluster = Annotated[str | None, Option(help="A Dask scheduler's address, in place of local processes.")]
+Cluster = Annotated[
+    str | None, Option(help="A Dask scheduler, in place of local processes; workers need this code and the same paths.")
+]
 Trust = Annotated[
     bool, Option("--trust", help="Use code, downloads and variables that the run or sheet names: you know who made it.")
 ]
