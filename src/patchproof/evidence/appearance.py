@@ -246,9 +246,10 @@ def match_design(seen: np.ndarray, promised: np.ndarray, usable: np.ndarray, lig
     chroma = float(found[1] * own[0] / max(found[0] * own[1], 1e-9))
     hues, *seen_hues = (v - v.mean(1, keepdims=True) for v in (x, y, y[:, ::-1]))
     alike, swapped = (float(np.corrcoef(hues.ravel(), each.ravel())[0, 1]) for each in seen_hues)
-    if own[1] > _LEAST_CHROMA * own[0] and swapped > LEAST_LIKENESS > alike + _SWAPPED_BY:
+    is_colorful = own[1] > _LEAST_CHROMA * own[0]
+    if is_colorful and swapped > LEAST_LIKENESS > alike + _SWAPPED_BY:
         return DesignMatch(likeness, PhotoRejected("wrong_ink", alike, LEAST_LIKENESS, _SWAPPED_ADVICE))
-    if own[1] > _LEAST_CHROMA * own[0] and chroma < LEAST_INK:
+    if is_colorful and chroma < LEAST_INK:
         return DesignMatch(likeness, PhotoRejected("wrong_ink", chroma, LEAST_INK, _GRAY_ADVICE))
     if own[2] < _LEAST_COLORFUL * own[0]:  # a design in gray or two inks tells no contrasts: compare its two colors
         centered = promised - promised.mean(0)

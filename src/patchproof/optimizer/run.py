@@ -134,7 +134,7 @@ def optimize(
         steps, views = effort_of(scene := resolve_scene(scene, seed), draft, thorough, None, promise.views)
         if resume and is_file(out / RUN_FILE):  # `promise` may have made a fuller one of the finished design
             present = validate_model(_Record, read_json(out / RUN_FILE, "a run", "optimize again"), str(out)).promise.n
-            views = max(views or PROMISE_VIEWS, present) if views or present > PROMISE_VIEWS else None
+            views = present if present > (views or PROMISE_VIEWS) else views
         scene, promise = scene.with_steps(steps), replace(promise, views=views)
         save_place, searched = None, {}
         if not scene.HAS_PLACE:
