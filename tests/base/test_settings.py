@@ -147,6 +147,8 @@ def test_lengths_are_finite_positive_numbers(tmp_path, value):
         "[optimize]\nseed = 4294967296",
         "[optimize]\nseed = 99999999999999999999",
         "[optimize]\nsteps = 1.5",
+        "[view]\ndistance_mm = [true, 500]",
+        "[view]\ndistance_mm = ['440', 500]",
         "[optimize]\noptimizer = 'sgd'",
     ],
 )

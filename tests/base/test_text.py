@@ -40,12 +40,20 @@ def read_all(folder, encode):
 
 def separated(separator):
     def read(folder):
-        (folder / "a.csv").write_text(f"a.png{separator}cat, tabby\nb.png{separator}dog\n", encoding="utf-8")
+        (folder / "a.csv").write_text(
+            f"a.png{separator}cat, tabby\nb.png{separator}dog\nc, d, e.png{separator}dog\n", encoding="utf-8"
+        )
         with pytest.raises(Refused) as error:
             read_csv(folder / "a.csv", "a CSV")
         return [str(error.value)]
 
     return read
+
+
+def test_a_quote_that_never_ends_swallows_no_rows(tmp_path):
+    (tmp_path / "a.csv").write_text('a.png,cat\nb.png,"bus\nc.png,dog\n', encoding="utf-8")
+    with pytest.raises(Refused, match=r"a\.csv that cannot be read"):
+        read_csv(tmp_path / "a.csv", "a CSV")
 
 
 def formula(folder):

@@ -133,6 +133,12 @@ def test_missing_or_broken_libraries_are_named_with_the_command(tmp_path, monkey
         load_classifier("torchvision:resnet50", tmp_path)
 
 
+def test_weights_without_bytes_of_their_own_have_no_sum():
+    sparse = torch.nn.Linear(2, 2)
+    sparse.register_buffer("eye", torch.eye(2).to_sparse())
+    assert weights_sha256(sparse) is None and weights_sha256(torch.nn.Linear(2, 2)) is not None
+
+
 def fake_torchvision(monkeypatch, network, broken=False) -> None:
     seen = types.SimpleNamespace(crop_size=[16], mean=[0.4, 0.5, 0.6], std=[0.2, 0.3, 0.4])
     weights = types.SimpleNamespace(transforms=lambda: seen, meta={"categories": list(LABELS)})

@@ -25,6 +25,7 @@ from patchproof.classifier.builtin import WEIGHTS_FOLDER
 from patchproof.classifier.builtin_detector import INPUT_PX
 from patchproof.classifier.detector import NO_BOX_LOGIT, Detector, iou
 from patchproof.classifier.load import load_classifier
+from patchproof.classifier.network_file import read_card
 from patchproof.optimizer.subject import target_loss
 from patchproof.render.stage import set_stage
 from patchproof.render.views import render_views
@@ -157,6 +158,13 @@ def test_findings_of_any_number_become_candidates_with_gradients():
     assert logits[1].tolist() == [NO_BOX_LOGIT, NO_BOX_LOGIT]
     (gradient,) = torch.autograd.grad(logits.sum(), photos)
     assert gradient[0].sum().item() == pytest.approx(1 / 0.75 + 1 / 0.25) and not gradient[1].any()
+
+
+def test_labels_that_count_from_one_are_refused_and_a_single_label_is_read(tmp_path):
+    with pytest.raises(Refused, match=r'labels from 0 to 0, got 1 from the network: .* "background" first'):
+        pp.detector_of(Found(), 8, ["cat"]).logits(torch.full((1, 3, 8, 8), 0.75), np.array([FOUR]))
+    (tmp_path / "a.json").write_text('{"input_px": 8, "labels": ["cat"], "kind": "detector"}')
+    assert read_card(tmp_path / "a.json").labels == ("cat",)
 
 
 class Blind(torch.nn.Module):

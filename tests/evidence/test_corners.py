@@ -25,6 +25,7 @@ from patchproof.evidence.surface import printed_colors, surface_of
 from patchproof.evidence.task import promised_ranges
 from patchproof.optimizer.imported_design import import_patch
 from patchproof.optimizer.promise import PromiseOptions
+from patchproof.photo import read
 from patchproof.photo.read import Photo
 from patchproof.photo.registration import DesignCorners
 from patchproof.reprints.reprint import reprint
@@ -282,6 +283,35 @@ def test_corners_outside_of_the_picture_are_said(printed):
     (folder / "out.csv").write_text(f"{head}\n{name},-90,0,300,0,300,300,0,300")
     photo = judged(folder, folder / "out.csv", "outside").photos[0]
     assert (photo.code, photo.remark.figure) == ("no_corners", 90) and "480 × 360" in photo.remark.advice
+
+
+def test_corners_are_pixels_of_the_file_where_it_is_read_at_half_its_size(printed, monkeypatch):
+    folder, whole = printed[0], judged(printed[0], printed[0] / "photos" / "corners.csv", "whole").photos[0]
+    monkeypatch.setattr(read, "WHOLE_PX", 480 * 360 - 1)
+    half = judged(folder, folder / "photos" / "corners.csv", "half").photos[0]
+    assert (half.status, half.photo_px) == ("measured", (240, 180)) and whole.photo_px == (480, 360)
+    whole_px, half_px = (
+        apply_homography(np.array(photo.geometry.homography_px_from_mm), np.array([(80.0, 80.0)]))
+        for photo in (whole, half)
+    )
+    np.testing.assert_allclose(half_px, whole_px / 2, atol=0.3)
+
+
+def test_a_refusal_after_the_report_s_folder_was_checked_keeps_the_report(printed):
+    folder = printed[0]
+    judged(folder, folder / "photos" / "corners.csv", "kept")
+    before = {path.name: path.read_bytes() for path in (folder / "kept").iterdir() if path.is_file()}
+    (folder / "others.csv").write_text((folder / "photos" / "corners.csv").read_text().replace("photo", "other"))
+    options = {"models": ["module:fake_networks.red_against_blue"], "overwrite": True}
+    with pytest.raises(Refused, match="corners"):
+        verify(
+            folder / "photos",
+            folder / "print.json",
+            folder / "kept",
+            capture=CaptureInfo(corners=folder / "others.csv"),
+            **options,
+        )
+    assert {path.name: path.read_bytes() for path in (folder / "kept").iterdir() if path.is_file()} == before
 
 
 @pytest.mark.parametrize("size", ["1x1", "1e9x1e9"])

@@ -72,13 +72,12 @@ def shot(azimuth=10, distance=550, only_piece=True, first_id=0, **look):
     return photograph(raster(only_piece, first_id), homography, (800, 600), **{"blur_px": 0.5, **look})
 
 
-def measured(srgb, conditions=(), focal_px=None, scan_dpi=None, manifest=None):
+def measured(srgb, conditions=(), focal_px=None, scan_dpi=None, manifest=None, step=1):
     manifest = manifest or make_manifest()
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, identity_printer())
-    return measure(
-        pinhole_photo(Photo(srgb, focal_px), None), "a", surface, promised, promised_ranges(conditions), scan_dpi
-    )
+    photo = pinhole_photo(Photo(srgb, focal_px, step=step), None)
+    return measure(photo, "a", surface, promised, promised_ranges(conditions), scan_dpi)
 
 
 def test_a_good_photo_is_measured_and_its_pose_is_right():
@@ -345,6 +344,7 @@ def test_the_uncut_page_and_scans_are_measured_but_not_counted():
         assert (look.entry.status, look.entry.code, look.counted) == ("measured", code, False)
         scale = look.entry.scale
         assert (scale.scale_x, scale.scale_y) == pytest.approx((sx, sy), abs=0.002)
+    assert measured(scan, scan_dpi=150, step=2).entry.scale == scale  # of which each pixel was made of four
 
 
 def test_that_an_uncut_page_is_not_counted_is_said(tmp_path):

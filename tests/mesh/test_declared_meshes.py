@@ -595,6 +595,16 @@ def _(folder):
     assert colors == [(1, 0, 0), (0, 0, 1), (0, 1, 0)]
 
 
+@case("text in UTF-16, or neither in it nor in UTF-8")
+def _(folder):
+    for encoding in ("utf-16", "gbk"):
+        (folder / "m.mtl").write_text("newmtl 红\nKd 1 0 0\nnewmtl 绿\nKd 0 1 0\n", encoding)
+        text = "mtllib m.mtl\n" + SQUARE_OBJ + "usemtl 红\nf 1 2 3\nusemtl 绿\nf 1 3 4\n"
+        (folder / "a.obj").write_text(text, encoding)
+        colors = [material.base_color_linear for material in load_mesh(folder / "a.obj", 4, "y").materials]
+        assert colors == [(1, 0, 0), (0, 1, 0)]
+
+
 @case("a missing MTL file, usemtl that none defines")
 def _(folder):
     obj(folder, SQUARE_OBJ + "usemtl gold\n" + FACE, "", "no MTL file defines gold")

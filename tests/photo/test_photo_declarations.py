@@ -27,6 +27,7 @@ ADOBE, BT2020 = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06), (0.708, 0.292, 0.17, 0.797
 COLORS = np.array([(90, 150, 80), (200, 120, 100), (30, 40, 60), (128, 128, 128), (250, 240, 230), (9, 12, 8)])
 PIXELS = np.kron(COLORS.reshape(2, 3, 3), np.ones((8, 8, 1))).astype(np.uint8)
 GRAY = PIXELS[..., 1]
+PIXELS_IN_PLANES = (np.moveaxis(PIXELS, -1, 0).astype(np.uint16) * 257).reshape(PIXELS.shape)
 RIGHT_IF_SRGB = PIXELS[::8, ::8].astype(float)
 
 
@@ -132,6 +133,12 @@ def saved(pixels: np.ndarray | Image.Image, kind: str, **options) -> bytes:
     buffer = io.BytesIO()
     (pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels)).save(buffer, kind, **options)
     return buffer.getvalue()
+
+
+def without_second_part(jpeg: bytes) -> bytes:
+    """A JPEG without the second part of its ICC profile."""
+    start = jpeg.index(b"ICC_PROFILE\0\2") - 4
+    return jpeg[:start] + jpeg[start + 2 + int.from_bytes(jpeg[start + 2 : start + 4]) :]
 
 
 def exif(space: int | None = None, interop: str | None = None, orientation: int | None = None, **tags) -> Image.Exif:
@@ -271,6 +278,7 @@ CASES: dict[str, list[tuple[bytes, str, object]]] = {
     "orientation (tag 274)": [
         (tiff(np.rot90(PIXELS).copy(), {274: [6]}), "tif", RIGHT_IF_SRGB),
         (tiff((np.rot90(PIXELS).astype(np.uint16) * 257).copy(), {274: [6]}), "tif", RIGHT_IF_SRGB),
+        (tiff(np.rot90(GRAY).copy(), {274: [6]}), "tif", GRAY_RIGHT),
     ],
     "irot and imir": [
         (saved(PIXELS, "AVIF", xmp=XMP % 6, quality=100, subsampling="4:4:4"), "avif", RIGHT_IF_SRGB),
@@ -298,6 +306,13 @@ CASES: dict[str, list[tuple[bytes, str, object]]] = {
     "ICC profile that is broken, or of another kind of picture": [
         (saved(PIXELS, "PNG", icc_profile=content), "png", color_space.BROKEN_PROFILE)
         for content in (GAMMA18[:90], b"x" * 300, profile(SRGB, 1.8, b"GRAY"))
+    ]
+    + [
+        (
+            without_second_part(saved(PIXELS, "JPEG", icc_profile=GAMMA18 + bytes(70_000))),
+            "jpg",
+            color_space.BROKEN_PROFILE,
+        )
     ],
     "CMYK without a profile": [(saved(CMYK, kind), kind.lower(), color_space.BARE_INKS) for kind in ("JPEG", "TIFF")],
     "ICC profile of CMYK": [
@@ -354,6 +369,9 @@ CASES: dict[str, list[tuple[bytes, str, object]]] = {
         for pixels, right in ((PIXELS, RIGHT_IF_SRGB), (GRAY, GRAY_RIGHT))
     ]
     + [(tiff(PIXELS.astype(np.uint16) * 257), "tif", RIGHT_IF_SRGB)],
+    "16-bit colors in planes": [
+        (tiff(PIXELS_IN_PLANES, {284: [2], 273: [8, 776, 1544], 279: [768] * 3}), "tif", "unreadable"),
+    ],
     "12 bits in 12, or 10 to 14 in 16 by MaxSampleValue": [
         (tiff(WIDE, {281: [4095]}), "tif", AS_WIDE),
         (tiff(WIDE, bits=12), "tif", AS_WIDE),

@@ -136,13 +136,13 @@ def verify(
             from patchproof.evidence.annotations import load_corners
 
             options = replace(options, corners=load_corners(capture.corners))
-        if not resume:
-            output.clear_folder(out)
+        clear = (lambda: None) if resume else partial(output.clear_folder, out)
         if not isinstance(photos, str | Path):
-            photos = output.write_pictures(photos, out / _PHOTOS)
+            clear()
+            photos, clear = output.write_pictures(photos, out / _PHOTOS), lambda: None
         on_pictures, advance = partial(save_pictures, out / "pictures"), partial(progress, "verify")
         how: dict[str, Any] = {"on_pictures": on_pictures, "advance": advance, "look_at": look_at}
-        how |= {"compute": compute, "journal": out / JOURNAL_FILE, "resume": resume}
+        how |= {"on_start": clear, "compute": compute, "journal": out / JOURNAL_FILE, "resume": resume}
         report = gather_evidence(photos, manifest, options, **how)
         parameters |= {name: path and Path(path).name for name, path in files.items()}
         parameters["ledger_photos"] = ledger_photos

@@ -18,11 +18,14 @@ def read_csv(path: str | Path, expected: str) -> list[list[str]]:
     """Read rows that are not empty, without the apostrophes of `csv_lines`; refused if another separator is used."""
     text = read_text(path, expected)
     try:
-        rows = [row for row in csv.reader(io.StringIO(text, newline=""), skipinitialspace=True) if any(row)]
+        rows = [
+            row for row in csv.reader(io.StringIO(text, newline=""), skipinitialspace=True, strict=True) if any(row)
+        ]
     except csv.Error as error:
         raise Refused(expected, f"{path} that cannot be read ({error})", "correct that file") from error
     for separator, name in ((";", "semicolons"), ("\t", "tabs")):
-        if rows and all(separator in row[0] for row in rows):
+        is_uneven = len({*map(len, rows)}) > 1  # by commas, which names hold, too
+        if rows and all(any(separator in cell for cell in (row if is_uneven else row[:1])) for row in rows):
             raise Refused(f"{expected}, separated by commas", f"{path} with {name}", "save it with commas")
     return [[cell[1:] if cell.startswith("'") and _FORMULA.match(cell, 1) else cell for cell in row] for row in rows]
 

@@ -126,7 +126,9 @@ def open_lazily(source: Path | bytes) -> "Image":
         raise OSError("an empty file")  # or one of the system's, of which Pillow would not see the end
     Image.init()
     formats = [name for name in IMAGE_FORMATS if name in Image.OPEN]
-    return Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=formats)
+    image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=formats)
+    image.filename = ""  # or Pillow would map the file's memory, and read the rows of turned TIFFs at a wrong length
+    return image
 
 
 class _Expired(BaseException):

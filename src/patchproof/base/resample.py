@@ -20,7 +20,7 @@ def downscale(pixels: np.ndarray, longest_px: int) -> np.ndarray:
     return cv2.resize(pixels, downscaled_size(pixels.shape[1::-1], longest_px), interpolation=cv2.INTER_AREA)
 
 
-def downscaled_size(size_px: tuple[int, ...], longest_px: int) -> tuple[int, int]:
+def downscaled_size(size_px: tuple[int, ...], longest_px: float) -> tuple[int, int]:
     """Width and height in proportion, the longer side at most `longest_px`, neither below 1."""
     scale = min(1.0, longest_px / max(size_px))
     width, height = (max(1, round(side * scale)) for side in size_px)

@@ -30,7 +30,7 @@ def check_ordered(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # neither true nor text
 Positive = Annotated[Finite, Field(gt=0)]
 NotNegative = Annotated[Finite, Field(ge=0)]
 RandomSeed = Annotated[int, Field(ge=0, le=2**32 - 1)]
@@ -160,7 +160,8 @@ def _explain(model: type[BaseModel], error: ErrorDetails, source: str) -> Refuse
     if error["type"] == "missing":
         return Refused(f'the key "{key}" in {source}', "none", f"add {key}")
     value = error.get("input")
-    value = brief(value) if callable(value) or hasattr(value, "shape") else str(value)
+    is_text = isinstance(value, str) and error["type"] == "float_type"
+    value = brief(value) if is_text or callable(value) or hasattr(value, "shape") else str(value)
     value = value if len(value) < 80 else value[:77] + "..."
     reason = error["msg"].removeprefix("Value error, ").rstrip(".")
     reason = reason[0].lower() + reason[1:]

@@ -62,9 +62,14 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
 
 def _check_gradient(classifier: Classifier, photos: Tensor, name: str) -> None:
     """Check that the best logit's gradient at the pixels is finite and not zero."""
-    photos = photos.clone().requires_grad_(True)
-    best = classifier.square_logits(photos).max(1).values.sum()
-    gradient = torch.autograd.grad(best, photos, allow_unused=True)[0] if best.requires_grad else None
+    photos, gradient = photos.clone().requires_grad_(True), None
+    try:
+        best = classifier.square_logits(photos).max(1).values.sum()
+        if best.requires_grad:
+            gradient = torch.autograd.grad(best, photos, allow_unused=True)[0]
+    except Exception as error:  # such as that of weights made in inference mode
+        got = f"{name}, whose gradient fails ({type(error).__name__}: {error_summary(error)})"
+        raise Refused("a gradient from the logits to the pixels", got, "use a network that can be trained") from error
     if gradient is None or not torch.isfinite(gradient).all() or not (gradient.abs().amax((1, 2, 3)) > 0).all():
         got = f"{'none' if gradient is None else 'a zero or infinite one'} from {name}"
         raise Refused("a gradient from the logits to the pixels", got, "use a network of differentiable operations")

@@ -35,6 +35,8 @@ GRID_BOXES = 16  # from which candidates are taken for those of a grid's cells, 
 _GUESSES = "ultralytics nanodet nanodet-plus yolov8-raw retinanet ssd300 ssdlite320 fcos torchvision-fcos detr".split()
 _ORDERS = "xyxy", "cxcywh", "xywh", "yxyx"
 _WORDS = {"boxes": "box|reg|loc|dis|delta", "objectness": "obj|cent|ctr", "scores": "score|cls|class|conf|logit|prob"}
+_MOST_SUPPRESSED = 1000  # rows that networks keep of their candidates, which are more
+_SURE = 0.05  # scores below are of rows that only fill a table
 OutputShape = tuple[int, ...]  # without the number of pictures
 Shapes = tuple[OutputShape, ...]
 OutputLayout = tuple[OutputShape, tuple[str, ...], OutputShape]  # a table's order of dimensions, columns, numbers
@@ -89,6 +91,9 @@ class HeadDecoder:
 
 def spread_labels(boxes: Tensor, labels: Tensor, scores: Tensor, count: int) -> Tensor:
     """Return candidates N×M×(4+`count`) of boxes N×M×4 with one label each, which is ignored beyond 0..count-1."""
+    if bool(((labels >= count) & (scores > _SURE)).any()):
+        do = 'list a name for each of its numbers, and "background" first if it counts from 1'
+        raise Refused(f"labels from 0 to {count - 1}", f"{int(labels.max())} from the network", do)
     score = scores.clamp(1e-6, 1 - 1e-6).logit().masked_fill((labels < 0) | (labels >= count), NO_BOX_LOGIT)[..., None]
     logits = scores.new_full((*scores.shape, count), NO_BOX_LOGIT)
     return torch.cat([boxes, logits.scatter(-1, labels.long().clamp(0, count - 1)[..., None], score)], -1)
@@ -232,6 +237,8 @@ def _layouts(decoder: HeadDecoder, head: Head, names: Sequence[str], shapes: Sha
     taken = {role for found in options if len(found) == 1 for role in found[0][1]}
     for number, (found, name) in enumerate(zip(options, head.outputs or names, strict=False)):
         if len(found) > 1:
+            if any("labels" in each[1] for each in found):  # of what a network has suppressed itself there are few rows
+                found = [each for each in found if ("labels" in each[1]) == (shapes[number][0] <= _MOST_SUPPRESSED)]
             rest = found if head.outputs else [each for each in found if not taken & {*each[1]}]
             said = [each for each in rest if any(re.search(_WORDS[role], name, re.I) for role in each[1])]
             options[number] = rest if len(rest) == 1 else said

@@ -160,11 +160,16 @@ def freeze(network: torch.nn.Module) -> torch.nn.Module:
 
 
 def weights_sha256(network: object) -> str | None:
-    """SHA-256 over names, types, shapes and bytes of a module's state, in the order of the names; None without any."""
+    """SHA-256 over names, types, shapes and bytes of a module's state, in the order of the names; None without any, and
+    for weights without bytes of their own (quantized, sparse, still lazy, not tensors).
+    """
     if not isinstance(network, torch.nn.Module) or not network.state_dict():
         return None
     digest = hashlib.sha256()
-    for name, tensor in sorted(network.state_dict().items()):
-        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
-        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    try:
+        for name, tensor in sorted(network.state_dict().items()):
+            digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+            digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    except (AttributeError, RuntimeError):  # NotImplementedError, too
+        return None
     return digest.hexdigest()

@@ -131,10 +131,11 @@ def read_card(path: Path) -> Card:
         labels = read_json(path.parent / Path(labels).name, "a JSON file", advice, advice)
     if type(input_px) is not int or input_px not in INPUT_PX:
         raise Refused("input_px, a whole number of pixels from 8 to 4096", f"{input_px!r} in {path}", do)
-    if not isinstance(labels, list) or len(labels) < 2 or {*map(type, labels)} != {str}:
-        raise Refused("labels, a list of two or more names", f"{str(labels)[:60]} in {path}", do)
     kind = card.get("kind", Detector.KIND if "head" in card else Classifier.KIND)
     if kind not in (Classifier.KIND, Detector.KIND):
         raise Refused(f'kind, "{Classifier.KIND}" or "{Detector.KIND}"', f"{kind!r} in {path}", "write one of these")
+    least = 1 if kind == Detector.KIND else 2
+    if not isinstance(labels, list) or len(labels) < least or {*map(type, labels)} != {str}:
+        raise Refused(f"labels, a list of {least} or more names", f"{str(labels)[:60]} in {path}", do)
     check_entries(card, path, _CARD_NOTES)
     return Card(input_px, tuple(labels), kind, head_of(card["head"], str(path)) if "head" in card else None)

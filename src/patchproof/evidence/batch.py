@@ -258,9 +258,11 @@ def _measure(task: Task, item: PhotoItem) -> MeasuredPhoto:
     view = pinhole_photo(photo, task.camera)
     corners = item.corners
     if corners is not None:
-        outside = float(np.maximum(-corners.px, corners.px - size_px).max())
-        if outside > _MOST_OUTSIDE * max(size_px):
-            raise PhotoRejected("no_corners", outside, 0.0, _OUTSIDE_ADVICE.format(*size_px))
+        stored_px = photo.step * np.array(size_px)
+        outside = float(np.maximum(-corners.px, corners.px - stored_px).max())
+        if outside > _MOST_OUTSIDE * max(stored_px):
+            raise PhotoRejected("no_corners", outside, 0.0, _OUTSIDE_ADVICE.format(*stored_px))
+        corners = replace(corners, px=corners.px / photo.step, sigma_px=corners.sigma_px / photo.step)
         if view.calibrated and task.camera is not None:
             corners = replace(corners, px=task.camera.undistort_points(corners.px, size_px))
     parts = task.surface, task.promised, task.ranges, task.scan_dpi

@@ -8,7 +8,7 @@ journal, finished photographs survive a kill.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -54,17 +54,19 @@ def gather_evidence(
     compute: Compute = Compute(),
     journal: Path | None = None,
     resume: bool = False,
+    on_start: Callable[[], None] = lambda: None,
     look_at: Callable[[Sequence[PhotoEntry]], Look | None] = lambda entries: PLANNED_LOOK,
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     advance: Advance = no_advance,
 ) -> Report:
     """Measure, classify and judge every picture in the folder, or the one picture, `photos`; subfolders are sessions.
 
-    Photographs are measured by the processes or the cluster of `compute`. The file `journal` records
-    finished photographs; with `resume` those of an earlier run are not measured again. `look_at` tells the look from
-    the entries, see `report_of`. `on_pictures` gets a name and pictures by kind (`photo`, and `seen`, `fitted`,
-    `promised`, `delta_e00` of a measured one) of the first `batch.MAX_PICTURED_PHOTOS` photographs when each is
-    measured; `advance` is called with (done, total).
+    Photographs are measured by the processes or the cluster of `compute`. The file `journal` records finished
+    photographs; with `resume` those of an earlier run are not measured again. `on_start` is called when nothing is left
+    that could be refused, before the journal is opened. `look_at` tells the look from the entries, see `report_of`.
+    `on_pictures` gets a name and pictures by kind (`photo`, and `seen`, `fitted`, `promised`, `delta_e00` of a measured
+    one) of the first `batch.MAX_PICTURED_PHOTOS` photographs when each is measured; `advance` is called with (done,
+    total).
     """
     print_scale = None if options.ruler_mm is None else ruler_scale(options.ruler_mm, manifest.ruler_mm)
     controls_folder = None if options.controls is None else Path(options.controls)
@@ -89,10 +91,11 @@ def gather_evidence(
             items[:count] = [replace(item, corners=px) for item, px in zip(items[:count], corners, strict=True)]
             if remaining:
                 left_out.append(f"corners of {len(remaining)} other photographs ({summarize_names([*remaining])})")
-    with (
-        open_workers(compute.jobs, compute.cluster) as workers,  # first: no journal if its cluster is not there
-        closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext() as log,
-    ):
+    with ExitStack() as stack:
+        workers = stack.enter_context(open_workers(compute.jobs, compute.cluster))  # a cluster may not be there
+        on_start()
+        log = Journal(journal, settings_key(manifest, options), resume) if journal else None
+        stack.callback(log.close if log else lambda: None)
         results = measure_all(task, items, judges, workers, log, on_pictures, advance)
         if options.corners and not options.find:
             for number, (item, result) in enumerate(zip(items, results, strict=True)):

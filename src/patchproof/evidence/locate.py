@@ -51,7 +51,8 @@ FOCAL_ERROR = 0.005  # relative, 95 %, of a camera file
 @dataclass(frozen=True)
 class PinholePhoto:
     """A photograph uint8 H×W×3 without lens distortion, its camera matrix (None: unknown), whether a camera file gave
-    it, the standard deviation of the focal length's logarithm, and whether EXIF's focal length is of an uncropped file.
+    it, the standard deviation of the focal length's logarithm, whether EXIF's focal length is of an uncropped file, and
+    how many pixels of the file one is in both directions.
     """
 
     srgb: np.ndarray
@@ -59,6 +60,7 @@ class PinholePhoto:
     calibrated: bool
     focal_spread: float = EXIF_SPREAD
     cropped: bool = False
+    step: int = 1
 
 
 def pinhole_photo(photo: Photo, camera: "Camera | None") -> PinholePhoto:
@@ -68,10 +70,11 @@ def pinhole_photo(photo: Photo, camera: "Camera | None") -> PinholePhoto:
         for candidate in (camera, _turn_clockwise(camera)):
             if candidate.fits((width, height)):
                 matrix = candidate.matrix_px((width, height))
-                return PinholePhoto(_undistort(photo.srgb, candidate, matrix), matrix, True, FOCAL_ERROR / 1.96)
+                srgb = _undistort(photo.srgb, candidate, matrix)
+                return PinholePhoto(srgb, matrix, True, FOCAL_ERROR / 1.96, step=photo.step)
     focal = photo.focal_px
     matrix = None if focal is None else np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return PinholePhoto(photo.srgb, matrix, False, photo.focal_spread, photo.focal_rejected)
+    return PinholePhoto(photo.srgb, matrix, False, photo.focal_spread, photo.focal_rejected, photo.step)
 
 
 def _turn_clockwise(camera: "Camera") -> "Camera":

@@ -139,7 +139,7 @@ def measure(
         told = told.changed(tilt_uncertainty_deg=float(np.hypot(geometry.tilt_uncertainty_deg or 0, UNCONFIRMED_DEG)))
     entry = partial(entry, geometry=told, pose=pose, box=object_box(view, location, surface))
     page_check = _is_uncut(location, detected, surface)
-    scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi)
+    scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi / view.step)
     counted = not page_check and scale is None
     trouble = _trouble(geometry, fit, detected, surface, found_corners)
     color, pictures, match = None, {}, DesignMatch()

@@ -7,6 +7,7 @@ used and others are said. Left out on purpose: curves, surfaces, smoothing group
 """
 
 from array import array
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections import Counter, defaultdict
 from itertools import takewhile
 from pathlib import Path
@@ -29,7 +30,11 @@ _Faces = tuple[dict[str, int], "array[int]", "array[int]"]
 
 def logical_lines(data: bytes) -> list[str]:
     """Return the lines of a text; a backslash at a line's end continues it."""
-    text = data.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+    try:
+        text = data.decode("utf-16" if data[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig")
+    except UnicodeDecodeError:  # of another encoding, in which names must stay apart
+        text = data.decode("latin-1")
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
     return text.replace("\\\n", " ").split("\n")
 
 
@@ -68,7 +73,7 @@ class MaterialLibrary:
             material = VERTEX_COLORS
             if texture is not None or not has_colors:
                 material = Material(name or "unnamed", self._kd(name, values, texture is not None), texture)
-            self.wraps |= {material: ("clamp", "clamp")} if options.get("-clamp") == "on" else {}
+            self.wraps |= {material: ("clamp", "clamp")} if options.get("-clamp", "").casefold() == "on" else {}
             scale, shift = _numbers(options.get("-s", "")), _numbers(options.get("-o", ""))
             self._made[name, has_uv] = material, np.array([*scale, 1, 1])[:2], np.array([*shift, 0, 0])[:2]
         return self._made[name, has_uv]
@@ -76,6 +81,8 @@ class MaterialLibrary:
     def _kd(self, name: str, values: dict[str, str], has_texture: bool) -> tuple[float, float, float]:
         """Return Kd as linear light; one number counts for all three, and black beside a texture as white."""
         kd = _numbers(text := values.get("kd", ""))
+        if max(kd, default=0) > 1:
+            self.assets.say(f"Kd {text[:40]} of {name} is cut at 1")
         if len(kd) < len(text.split()):  # "spectral" and "xyz" are allowed, too
             self.assets.say(f"Kd {text[:40]} of {name} is not read")
         if len(kd) not in (1, 3) or len(kd) < len(text.split()) or (has_texture and not any(kd)):

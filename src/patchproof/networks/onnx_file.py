@@ -71,7 +71,7 @@ def read_onnx(
     model = MessageReader().message(memoryview(stored), _SCHEMAS["model"])
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
-        raise UnsupportedNetwork(f"opset {quote(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
+        raise UnsupportedNetwork(f"opset {quote(versions)[1:-1] or 'none'}, not one from {OPSETS[0]} to {OPSETS[1]}")
     metadata = {entry.get("key", ""): entry.get("value", "") for entry in model.get("metadata", [])}
     return *_GraphReader(model["graph"], _Weights(read_data), versions[0]).read(join), metadata
 

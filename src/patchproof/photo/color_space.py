@@ -40,7 +40,8 @@ _INTEROP_IFD, _COLOR_SPACE, _GAMMA, _WHITE_TAG, _PRIMARIES_TAG = 0xA005, 0xA001,
 _MODES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}  # of pictures, by their profile's
 LINEAR_LIGHT = "floating-point values, read as linear light from 0 to 1, or to their maximum above 1"
 SHALLOW = "16-bit values that all fit into {} bits, which the file does not declare: read as dark as it stores them"
-_BITS, _INVERTED, _MAXIMA, _SIGNED = 258, 262, (341, 281), 339
+_BITS, _INVERTED, _ORIENTATION, _PLANES, _MAXIMA, _SIGNED = 258, 262, 274, 284, (341, 281), 339
+_PLANES_ADVICE = "its 16-bit colors are stored in planes: save it interleaved, pixel by pixel, or as PNG"
 _DEPTHS = {1023: 10, 4095: 12, 16383: 14}
 
 
@@ -53,7 +54,9 @@ class ColorSpace(NamedTuple):
 
 def color_space(image, head: bytes) -> tuple[ColorSpace | None, tuple[str, ...]]:
     """The color space of a picture in a file with this `head`, None for sRGB, and sentences on what is left aside."""
-    profile = image.info.get("icc_profile")
+    profile = image.info.get("icc_profile", b"")
+    if profile is None:  # a part of it is missing
+        return None, (BROKEN_PROFILE,)
     if (cicp := _cicp(image.format, head)) and (image.format == "PNG" or not profile):
         primaries, transfer, full_range = cicp
         if primaries not in _PRIMARIES or transfer not in _CURVES or not full_range:
@@ -172,6 +175,8 @@ def deep_codes(
     """(uint16 codes H×W×3, or None of 8 bits; their space if the picture declares `space`; how a range is assumed)."""
     tags, said = getattr(image, "tag_v2", {}), ()
     bits, signed = tags.get(_BITS, (16,))[0], tags.get(_SIGNED, (1,))[0] == 2
+    if bits == 16 and image.mode in ("RGB", "RGBA") and tags.get(_PLANES) == 2:
+        raise PhotoRejected("unreadable", None, None, _PLANES_ADVICE)  # neither OpenCV nor Pillow reads them
     if image.mode == "F":
         codes = np.nan_to_num(np.asarray(image), posinf=1.0)
         space, said = rgb_space(SRGB_PRIMARIES, None, 1.0), (LINEAR_LIGHT,)
@@ -180,7 +185,8 @@ def deep_codes(
         codes, top = np.asarray(image), (1 << bits - signed) - 1
         codes = codes.view(np.uint32) if bits == 32 and not signed else codes
     else:
-        codes, top = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if (image.mode, bits) == ("RGB", 16) else None, 65535
+        deep = (image.mode, bits) == ("RGB", 16) and tags.get(_ORIENTATION, 1) < 5  # OpenCV fails at turned ones
+        codes, top = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if deep else None, 65535
         if codes is None or codes.dtype != np.uint16 or codes.shape != (image.height, image.width, 3):
             return None, space, ()
         codes = codes[..., ::-1]

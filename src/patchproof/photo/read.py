@@ -77,6 +77,7 @@ class Photo:
     is_crop: bool = False  # a crop or a screenshot, as far as file name and EXIF tell
     dpi: tuple[float, ...] = ()  # (x, y) as the file states it, for scans; 0 or empty if it does not
     said: tuple[str, ...] = ()  # what the file declares and is left aside, a phrase for each kind
+    step: int = 1  # pixels of the file to a pixel of `srgb`, in both directions
 
 
 def read_photo(path: str | Path) -> Photo:
@@ -122,7 +123,7 @@ def _decode(path: Path) -> tuple[Photo, int]:
         (orientation, contradiction), rest = _orientation(image), _left_aside(image, head)
         srgb, said = _decode_pixels(image, path, head, step)
         said = (*contradiction, *rest, *said)
-        return Photo(srgb, focal_px and focal_px / step, spread, rejected, cropped, dpi, said), orientation
+        return Photo(srgb, focal_px and focal_px / step, spread, rejected, cropped, dpi, said, step), orientation
 
 
 def _orientation(image) -> tuple[int, tuple[str, ...]]:
