@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -277,6 +278,12 @@ def test_photographs_that_show_no_chart(shots):
     white = Photo((srgb_from_linear(light.clip(0, 1)) * 255).astype(np.uint8), None)
     with pytest.raises(PhotoRejected, match=r"clipped|too_few"):
         read_chart(white, manifest)
+    paper = read_chart(Photo(small, None), manifest).paper
+    for share in (0.15, 0.1):
+        light = linear_from_srgb(small / 255) * share / np.mean(paper)
+        dark = Photo((srgb_from_linear(light) * 255 + 0.5).astype(np.uint8), None)
+        with nullcontext() if share == 0.15 else pytest.raises(PhotoRejected, match="noisy: the paper is too dark"):
+            read_chart(dark, manifest)
 
 
 def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):

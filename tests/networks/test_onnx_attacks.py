@@ -216,7 +216,7 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     "two inputs": (lambda: changed(lambda m: m.graph.input.add(name="x2")), "2 inputs, not one of N×3×S×S"),
     "two outputs": (lambda: changed(lambda m: m.graph.output.add(name="b")), "2 outputs, not one"),
     "a weight for a result": (lambda: changed(lambda m: setattr(m.graph.output[0], "name", "F")), "1 outputs, not"),
-    "no opset": (lambda: changed(lambda m: m.ClearField("opset_import")), "opset , not one from 7"),
+    "no opset": (lambda: changed(lambda m: m.ClearField("opset_import")), "opset none, not one from 7"),
     "an opset of long ago": (lambda: model(SMALL, 6), "opset 6, not one from 7 to 28"),
     "an opset of the future": (lambda: model(SMALL, 29), "opset 29, not one from 7 to 28"),
     "bytes for pictures": (
@@ -288,7 +288,7 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
     ),
     "dimensions without end": (lambda: ending(f"y = Unsqueeze(z, {list(range(40))})"), "more than 12 dimensions"),
     # bytes
-    "nothing": (lambda: b"", "opset , not one from"),
+    "nothing": (lambda: b"", "opset none, not one from"),
     "a pickle": (lambda: pickle.dumps(sys.exit), "ONNX file"),
     "an archive": (lambda: b"PK\3\4" + bytes(200), "ONNX file"),
     "half a file": (lambda: small().SerializeToString()[:-40], "a field that ends after the file does"),

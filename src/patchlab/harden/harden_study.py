@@ -58,7 +58,7 @@ class HardenSettings(StrictModel):
     # ε of a PGD attack that each step is taken under, so that images withstand it; takes eight times the passes.
     through: Annotated[Share, Field(gt=0)] | None = None
     attacks: tuple[Attack, ...] = ("fgsm", "pgd")  # attacks to withstand
-    attack_epsilons: tuple[Annotated[Share, Field(gt=0)], ...] = (0.01, 0.02, 0.04)  # the attacks' largest change
+    attack_epsilons: tuple[Annotated[float, Field(gt=0, le=1)], ...] = (0.01, 0.02, 0.04)  # the attacks' largest change
     attack_steps: PositiveInt = PGD_STEPS  # steps of PGD
     attack_step_size: Positive = PGD_STEP  # of PGD, as a share of ε
     restarts: Annotated[int, Field(ge=0)] = 0  # random starts of PGD besides the photograph itself

@@ -281,7 +281,7 @@ def _color_tables(settings: RealPrintsSettings, photos: Sequence[Mapping[str, An
         for photo in photos:
             groups.setdefault(f"{key} {photo[key]}", []).append(photo)
     rows = [
-        (name, *(median([p[k] for p in some]) for k in ("distance", "within", "scatter")))
+        (name, *((median if len(some) > 1 else min)([p[k] for p in some]) for k in ("distance", "within", "scatter")))
         for name, some in groups.items()
     ]
     yield Table("colors", "Colors of the median photograph", head, tuple(rows), about)

@@ -45,6 +45,8 @@ MIN_SWATCHES = 4  # paper, black and two others
 MAX_PHOTO_DELTA_E00 = 5.0  # from its print's other photographs: more than light or camera can explain
 MIN_CORE_PX = 4.0  # a swatch's side between blurred borders
 MAX_CLIPPED_SHARE = 0.05  # share of white paper at full white; beyond it, its light is unknown
+# of paper's light: below, noise that is cut off at 0 lifted black of .13 in sRGB to .17 (0.09) and .23 (0.05)
+_LEAST_PAPER = 0.12
 _LEAST_CHROMA = 0.05  # in linear light, between the channels of the most colorful swatch: saturated inks have 0.5
 _CORE_MARGIN = 0.2  # of a swatch's side: the least margin on each side
 _SAMPLES = 15  # along each side of a core
@@ -276,4 +278,6 @@ def _paper_at(points_mm, srgb: np.ndarray, manifest: Manifest, px_from_mm: np.nd
     if light.max() > (full := LINEAR_FROM_CODE[CLIPPED_CODE]) or light.min() <= 0:
         advice = "the paper is overexposed, or its light too uneven: lower the exposure by one step, in even light"
         raise PhotoRejected("clipped", float(light.max()), float(full), advice)
+    if (dark := float(light.mean(1).min())) < _LEAST_PAPER:
+        raise PhotoRejected("noisy", dark, _LEAST_PAPER, "the paper is too dark: use more light, or expose longer")
     return light

@@ -134,8 +134,8 @@ def read_card(path: Path) -> Card:
     kind = card.get("kind", Detector.KIND if "head" in card else Classifier.KIND)
     if kind not in (Classifier.KIND, Detector.KIND):
         raise Refused(f'kind, "{Classifier.KIND}" or "{Detector.KIND}"', f"{kind!r} in {path}", "write one of these")
-    least = 1 if kind == Detector.KIND else 2
+    least, word = (1, "one") if kind == Detector.KIND else (2, "two")
     if not isinstance(labels, list) or len(labels) < least or {*map(type, labels)} != {str}:
-        raise Refused(f"labels, a list of {least} or more names", f"{str(labels)[:60]} in {path}", do)
+        raise Refused(f"labels, a list of {word} or more names", f"{str(labels)[:60]} in {path}", do)
     check_entries(card, path, _CARD_NOTES)
     return Card(input_px, tuple(labels), kind, head_of(card["head"], str(path)) if "head" in card else None)
