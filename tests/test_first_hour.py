@@ -148,7 +148,7 @@ def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     asked, new, preview, optimize, sheet, _, refused, verify = said.values()
     assert 'add --label with what it is to be recognized as: "lamp", "vase", "stone"' in asked
     assert "length: 340 mm, by the file's units" in new and "next: patchproof preview scene.toml" in new
-    assert '"lamp" first in ' in preview and "next: patchproof optimize scene.toml" in preview
+    assert '"lamp" recognized in ' in preview and "next: patchproof optimize scene.toml" in preview
     assert "Draft of" in optimize and "(preliminary): helps" in optimize
     assert "next: patchproof sheet run --out sheet.pdf" in optimize and "sheet.json" in sheet
     assert f"or name the networks yourself (--models '{MODEL}')" in refused

@@ -118,7 +118,7 @@ def test_a_page_shows_sides_piece_and_eight_views_with_labels(shown):
     assert "front (+z): <b>the piece hangs here</b>" in html
     assert html.count("piece hangs here") == 1 and html.count('x1="8" x2="312"') == 4  # upright sides have a ground
     assert html.count("<ol") == 8 and html.count("<li>") == 40 and html.count("<polygon") > 0
-    assert re.search(r'builtin: "carton" first in \d of 8 views of the bare object', preview.lines[-1])
+    assert re.search(r'builtin: "carton" recognized in \d of 8 views of the bare object', preview.lines[-1])
     assert preview.refused is None and 'class="note refused"' not in html
 
 

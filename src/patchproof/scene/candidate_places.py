@@ -64,7 +64,7 @@ class PlaceFinder:
                 yield spot
         if not found:
             expected = f"a place for a piece of {self.size_mm[0]:.0f} × {self.size_mm[1]:.0f} mm that views face"
-            remedy = "make it smaller, let it bend, or check the length of the object"
+            remedy = "make it smaller or let it bend, in a scene file (patchproof keys), or check the object's length"
             raise Refused(expected, f"{len(self._frames_to_try)} places at which it does not fit", remedy)
 
     @cached_property

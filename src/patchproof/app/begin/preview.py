@@ -205,8 +205,8 @@ def _answers(settings: SceneSettings, views: Sequence[Mapping[str, Any]]) -> lis
         ((most, times),) = Counter(answer["labels"][0][0] for answer in answers).most_common(1)
         count = sum(answer["recognized"] for answer in answers)
         lines.append(
-            f'{answers[0]["network"]}: "{settings.target.label}" first in {count} of {len(views)} views of the bare '
-            f'object; most often "{most}" ({times})'
+            f'{answers[0]["network"]}: "{settings.target.label}" recognized in {count} of {len(views)} views of the '
+            f'bare object; most often "{most}" ({times})'
         )
     return lines
 
