@@ -14,6 +14,7 @@ from patchproof.base.errors import Refused
 from patchproof.classifier import Classifier, load, load_classifier, zoo
 from patchproof.classifier.builtin import SmallNetwork
 from patchproof.classifier.check import check_network
+from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.load import use_full_precision
 from patchproof.classifier.network import weights_sha256
 
@@ -137,6 +138,13 @@ def test_weights_without_bytes_of_their_own_have_no_sum():
     sparse = torch.nn.Linear(2, 2)
     sparse.register_buffer("eye", torch.eye(2).to_sparse())
     assert weights_sha256(sparse) is None and weights_sha256(torch.nn.Linear(2, 2)) is not None
+
+
+def test_weights_of_inference_mode_are_refused_by_name(tmp_path):
+    with torch.inference_mode():
+        network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 8), torch.nn.Flatten())
+    with pytest.raises(Refused, match=r"whose gradient fails \(RuntimeError: Inference tensors"):
+        load_classifier(classifier_of(network, 8, ["a", "b", "c", "d"]), tmp_path)
 
 
 def fake_torchvision(monkeypatch, network, broken=False) -> None:

@@ -426,7 +426,7 @@ def network(outputs, **attributes):
 def test_modules_say_their_head_and_return_dictionaries():
     size, (logits, boxes), truth = detr(1)
     raw = network({"pred_logits": logits, "pred_boxes": boxes}, input_px=size, labels="a b c d e".split())
-    with pytest.raises(Refused, match=r'if it is a detector, write "kind": "detector" into its JSON, and "head"'):
+    with pytest.raises(Refused, match=r'logits alone, as a tensor, or give it kind = "detector", and a head for'):
         load_classifier(raw)
     raw.kind, raw.head = "detector", "detr"
     assert_equal(load_classifier(raw).network(torch.zeros(1, 3, size, size))[0], truth)
@@ -467,6 +467,12 @@ def test_both_shared_detectors_are_read_without_our_conversion(name, data, tmp_p
         whole = torch.cat(levels[::-1])
     torch.testing.assert_close(raw[:, :4], whole[:, :4], rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(raw[:, 4:].sigmoid(), whole[:, 4:].sigmoid(), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("rows", "last"), [(300, "labels"), (1344, "scores")])
+def test_six_columns_of_one_label_are_rows_that_were_kept_or_candidates_with_an_objectness(rows, last):
+    layouts, _, count = _plan(HeadDecoder("it", 1, 64), head_of("ultralytics", "here"), ("output0",), ((rows, 6),))
+    assert layouts[0][1][-1] == last and count == rows
 
 
 def test_the_notebook_s_figures_of_heads_are_those_of_the_stored_trials():

@@ -628,6 +628,7 @@ def _(folder):
         np.testing.assert_allclose(material.base_color_linear, linear_from_srgb(np.array(factor, float)))
         np.testing.assert_array_equal(material.texture_srgb, PIXELS)
     obj(folder, SQUARE_OBJ + FACE, "newmtl skin\nKd spectral a.rfl\n", "Kd spectral a.rfl of skin is not read")
+    obj(folder, SQUARE_OBJ + FACE, "newmtl skin\nKd 255 128 0\n", "Kd 255 128 0 of skin is cut at 1")
 
 
 @case("map_Kd relative to its MTL")

@@ -67,6 +67,8 @@ def _check_gradient(classifier: Classifier, photos: Tensor, name: str) -> None:
         best = classifier.square_logits(photos).max(1).values.sum()
         if best.requires_grad:
             gradient = torch.autograd.grad(best, photos, allow_unused=True)[0]
+    except (Refused, Warning):
+        raise
     except Exception as error:  # such as that of weights made in inference mode
         got = f"{name}, whose gradient fails ({type(error).__name__}: {error_summary(error)})"
         raise Refused("a gradient from the logits to the pixels", got, "use a network that can be trained") from error

@@ -90,7 +90,9 @@ class HeadDecoder:
 
 
 def spread_labels(boxes: Tensor, labels: Tensor, scores: Tensor, count: int) -> Tensor:
-    """Return candidates N×M×(4+`count`) of boxes N×M×4 with one label each, which is ignored beyond 0..count-1."""
+    """Return candidates N×M×(4+`count`) of boxes N×M×4 with one label each, which is ignored below 0; refused
+    are labels of `count` and more.
+    """
     if bool(((labels >= count) & (scores > _SURE)).any()):
         do = 'list a name for each of its numbers, and "background" first if it counts from 1'
         raise Refused(f"labels from 0 to {count - 1}", f"{int(labels.max())} from the network", do)
@@ -240,8 +242,9 @@ def _layouts(decoder: HeadDecoder, head: Head, names: Sequence[str], shapes: Sha
             if any("labels" in each[1] for each in found):  # of what a network has suppressed itself there are few rows
                 found = [each for each in found if ("labels" in each[1]) == (shapes[number][0] <= _MOST_SUPPRESSED)]
             rest = found if head.outputs else [each for each in found if not taken & {*each[1]}]
-            said = [each for each in rest if any(re.search(_WORDS[role], name, re.I) for role in each[1])]
-            options[number] = rest if len(rest) == 1 else said
+            if len(rest) > 1:
+                rest = [each for each in rest if any(re.search(_WORDS[role], name, re.I) for role in each[1])]
+            options[number] = rest
     if any(len(found) != 1 for found in options):
         do = f'say what each holds: "head": {{"name": "{head.name}", "outputs": ["boxes", "scores"]}}'
         raise decoder.refusal("boxes and scores that differ in shape or name", shapes, do)

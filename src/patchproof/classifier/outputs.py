@@ -43,7 +43,7 @@ def check_shape(output: Any, classifier: Classifier) -> None:
         if not is_tensor or len(shape) > 2:
             do = 'if it is a detector, write "kind": "detector" into its JSON, and "head" where its boxes are raw'
             if classifier.name.startswith(("module:", "python:")):
-                do = "return its logits alone, as a tensor, or make a detector of it with patchproof.detector_of"
+                do = 'return its logits alone, as a tensor, or give it kind = "detector", and a head for raw boxes'
     got = f"{shape if is_tensor else type(output).__name__} for 3 pictures from the network {classifier.name}"
     raise Refused(expected, got, do)
 

@@ -147,9 +147,7 @@ def places_by_templates(photo: SearchedPhoto, design: np.ndarray, size_mm: tuple
     while longer_px < 0.95 * most_px:
         scale = _TEMPLATE_PX / longer_px
         size = downscaled_size(photo.small.shape[1::-1], most_px * scale)
-        halvings = (
-            np.log2(max(photo.levels[0].shape[:2]) / max(size)) - 1
-        )  # at least twice the size: averages stay even
+        halvings = np.log2(max(photo.levels[0].shape[:2]) / max(size)) - 1  # of at least twice the size
         small = cv2.resize(photo.levels[int(np.clip(halvings, 0, last))], size, interpolation=cv2.INTER_AREA)
         middle = np.array(small.shape[1::-1]) / 2
         templates = list(_templates(drawn, small.shape[:2]))
