@@ -285,7 +285,7 @@ def test_corners_outside_of_the_picture_are_said(printed):
     assert (photo.code, photo.remark.figure) == ("no_corners", 90) and "480 × 360" in photo.remark.advice
 
 
-def test_corners_are_pixels_of_the_file_where_it_is_read_at_half_its_size(printed, monkeypatch):
+def test_corners_are_the_file_s_pixels_at_half_its_size_and_a_refusal_keeps_the_report(printed, monkeypatch):
     folder, whole = printed[0], judged(printed[0], printed[0] / "photos" / "corners.csv", "whole").photos[0]
     monkeypatch.setattr(read, "WHOLE_PX", 480 * 360 - 1)
     half = judged(folder, folder / "photos" / "corners.csv", "half").photos[0]
@@ -295,23 +295,19 @@ def test_corners_are_pixels_of_the_file_where_it_is_read_at_half_its_size(printe
         for photo in (whole, half)
     )
     np.testing.assert_allclose(half_px, whole_px / 2, atol=0.3)
-
-
-def test_a_refusal_after_the_report_s_folder_was_checked_keeps_the_report(printed):
-    folder = printed[0]
-    judged(folder, folder / "photos" / "corners.csv", "kept")
-    before = {path.name: path.read_bytes() for path in (folder / "kept").iterdir() if path.is_file()}
+    # a refusal of other corners keeps that report
+    before = {path.name: path.read_bytes() for path in (folder / "half").iterdir() if path.is_file()}
     (folder / "others.csv").write_text((folder / "photos" / "corners.csv").read_text().replace("photo", "other"))
     options = {"models": ["module:fake_networks.red_against_blue"], "overwrite": True}
     with pytest.raises(Refused, match="corners"):
         verify(
             folder / "photos",
             folder / "print.json",
-            folder / "kept",
+            folder / "half",
             capture=CaptureInfo(corners=folder / "others.csv"),
             **options,
         )
-    assert {path.name: path.read_bytes() for path in (folder / "kept").iterdir() if path.is_file()} == before
+    assert {path.name: path.read_bytes() for path in (folder / "half").iterdir() if path.is_file()} == before
 
 
 @pytest.mark.parametrize("size", ["1x1", "1e9x1e9"])
