@@ -170,6 +170,6 @@ def weights_sha256(network: object) -> str | None:
         for name, tensor in sorted(network.state_dict().items()):
             digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
             digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    except (AttributeError, RuntimeError):  # NotImplementedError, too
+    except (AttributeError, RuntimeError):  # such as of meta tensors
         return None
     return digest.hexdigest()
