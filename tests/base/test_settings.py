@@ -88,6 +88,28 @@ def test_a_missing_key_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
+        (
+            'models = ["builtin"]',
+            'models = "builtin"',
+            r"target\.models.*got 'builtin': .* a list in square brackets\.$",
+        ),
+        ('models = ["builtin"]', "models = []", r"got \[\]: list should have at least 1 item, not 0\.$"),
+        ('label = "jeep"', "label = 478.0", r'"target\.label".*got 478\.0: .* text in quotes or a valid integer\.$'),
+        ("height_mm = 30", "height_mm = 30\nbend = 1.5", r'"patch\.bend".*got 1\.5: .* true or false'),
+        (
+            "height_mm = 30",
+            "height_mm = 30\noffset_mm = [3]",
+            r"got \[3\]: patch\.offset_mm needs at least 2 values\.$",
+        ),
+    ],
+)
+def test_a_value_of_another_kind_is_refused_in_words_of_the_file(tmp_path, old, new, sentence):
+    assert re.search(sentence, refusal(scene(tmp_path, (old, new))))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
         ("length_mm = 100", "", 'usable "object".*object takes length_mm together with mesh'),
         ('mesh = "primitive:mug"\n', "", 'usable "object".*object takes one of mesh, photos or images'),
         ("length_mm = 100", 'length_mm = 100\nphotos = "p"\nsheet = "s"', "object takes one of mesh, photos or images"),

@@ -15,7 +15,7 @@ import patchproof as pp
 from patchproof.base.declarations import load_declarations
 from patchproof.base.errors import Refused
 from patchproof.classifier.detector import iou
-from patchproof.evidence.annotations import box_of_photo, find_in_photos, load_boxes
+from patchproof.evidence.annotations import box_of_photo, find_in_photos, load_boxes, load_corners
 from patchproof.evidence.classify import box_in_square
 
 BOXES_DECLARED = [
@@ -207,3 +207,10 @@ def test_what_boxes_declare_is_used_refused_or_said(tmp_path, entry):
             named = [("p1.jpg", tmp_path / "p1.tif")]
             (found,), _ = find_in_photos("boxes", load_boxes(path, "truck"), box_of_photo, named)
         assert found == pytest.approx(tuple(np.divide(UPRIGHT, (40, 30, 40, 30)))), arguments
+
+
+@pytest.mark.parametrize("load", [lambda path: load_boxes(path, "truck"), load_corners])
+def test_a_list_of_results_names_no_photographs_and_is_refused(load, tmp_path):
+    (tmp_path / "results.json").write_text('[{"image_id": 1, "category_id": 3, "bbox": [1, 2, 30, 40], "score": 0.9}]')
+    with pytest.raises(Refused, match=r"a list without the photographs' names: export annotations, not results\.?$"):
+        load(tmp_path / "results.json")

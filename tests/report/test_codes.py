@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from synthetic_photos import PIECE_IDS, make_manifest, view
 
-from patchproof.base.geometry import intrinsics
+from patchproof.base.geometry import apply_homography, intrinsics
 from patchproof.evidence import measure
 from patchproof.evidence.appearance import MOST_NOISE
 from patchproof.evidence.locate import FOCAL_ERROR, PinholePhoto, camera_pose
@@ -154,3 +155,25 @@ def test_paper_at_full_white_does_not_turn_the_map_of_colors(light):
     """With it as the fit's reference for white these state 3.5 and 6.6."""
     entry = measured(shot(light=light)).entry
     assert entry.code is None and entry.color.delta_e00_mean < 1
+
+
+@pytest.mark.parametrize(
+    ("share", "code"),
+    [(0.0, None), (0.06, None), (0.2, "too_few_markers"), (0.3, "too_few_markers"), (0.4, "other_design")],
+)
+@pytest.mark.parametrize("cover", [40, 160, 235])
+def test_a_design_that_is_partly_covered_is_not_another_one_and_its_colors_are_not_stated(share, code, cover):
+    """With something in its middle; all of its corners show. Two fifths are too much to tell it."""
+    look = shot()
+    x, y, width, height = SURFACE.rect_mm
+    middle, half = np.array([x + width / 2, y + height / 2]), np.sqrt(share) * np.array([width, height]) / 2
+    corners_px = apply_homography(
+        view(10, 5, 550, size_px=(800, 600)), middle + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+    )
+    if share:
+        cv2.fillPoly(look, [np.round(corners_px).astype(np.int32)], (cover, cover, 0.9 * cover))
+    found = measured(look)
+    assert (found.entry.code, found.counted) == (code, code != "other_design") and (found.entry.color is None) == (
+        code is not None
+    )
+    assert code != "too_few_markers" or found.entry.remark.advice == "part of the design is covered: show all of it"

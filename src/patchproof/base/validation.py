@@ -76,10 +76,16 @@ def validate_model(model: type[Model], data: Any, source: str) -> Model:
         return model.model_validate(data)
     except ValidationError as error:
         # a misspelled key is also a missing one, and its spelling is the more useful message
-        first = min(error.errors(), key=lambda error: error["type"] != "extra_forbidden")
-        raise _explain(model, first, source) from error
+        errors = sorted(error.errors(), key=lambda error: error["type"] != "extra_forbidden")
+        raise _explain(model, errors, data, source) from error
 
 
+_PLAIN = {
+    "a valid tuple": "a list in square brackets",
+    "tuple": "list",
+    "a valid string": "text in quotes",
+    "a valid boolean": "true or false",
+}
 # a network's name: the part up to its file, and the file
 NETWORK_FILE = re.compile(r"(file:|clip:[^@:]+@|(?:torchvision|timm):[^@:]+@(?=.+\.safetensors$))(.*)", re.DOTALL)
 
@@ -152,23 +158,49 @@ def _check_within(low: float, high: float, pair: tuple[float, float]) -> tuple[f
     return pair
 
 
-def _explain(model: type[BaseModel], error: ErrorDetails, source: str) -> Refused:
-    key = ".".join(str(part) for part in error["loc"])
+def _explain(model: type[BaseModel], errors: Sequence[ErrorDetails], data: Any, source: str) -> Refused:
+    """The refusal of the first of pydantic's errors; those of all kinds that its value might have are one reason."""
+    error, place = errors[0], _location(errors[0], data)
+    key, last = ".".join(map(str, place)), place[-1] if place else ""
     if error["type"] == "extra_forbidden":
-        hint = spelling_hint(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))
-        return Refused(f"only known keys in {source}", f'"{key}"', hint)
-    if error["type"] == "missing":
+        return Refused(
+            f"only known keys in {source}", f'"{key}"', spelling_hint(str(last), _keys_at(model, place[:-1]))
+        )
+    if error["type"] != "missing":
+        reasons = dict.fromkeys(_reason(each) for each in errors if _location(each, data) == place)
+        reason = " or ".join(reasons).replace(" or input should be", " or")
+    elif isinstance(last, int):
+        key, reason = ".".join(map(str, place[:-1])), f"needs at least {last + 1} values"
+    else:
         return Refused(f'the key "{key}" in {source}', "none", f"add {key}")
     value = error.get("input")
-    is_text = isinstance(value, str) and error["type"] == "float_type"
+    is_text = isinstance(value, str) and not error["type"].startswith(("value_", "literal_", "string_"))
     value = brief(value) if is_text or callable(value) or hasattr(value, "shape") else str(value)
     value = value if len(value) < 80 else value[:77] + "..."
-    reason = error["msg"].removeprefix("Value error, ").rstrip(".")
-    reason = reason[0].lower() + reason[1:]
     if not key:  # tables that contradict each other
         return Refused(f"settings in {source} that agree with each other", "a contradiction", reason)
-    do = f"{key} {reason}" if reason.startswith(("must", "takes")) else reason
+    do = f"{key} {reason}" if reason.startswith(("must", "takes", "needs")) else reason
     return Refused(f'a usable "{key}" in {source}', value, do)
+
+
+def _reason(error: ErrorDetails) -> str:
+    """What pydantic says of a value, in words of those who write files."""
+    text = error["msg"].removeprefix("Value error, ").rstrip(".").replace(" after validation", "")
+    text = text[0].lower() + text[1:]
+    for theirs, plain in _PLAIN.items():
+        text = text.replace(theirs, plain)
+    return text
+
+
+def _location(error: ErrorDetails, data: Any) -> tuple[int | str, ...]:
+    """Where an error is, without the kinds of value that were tried there: ("label", "str") is ("label",)."""
+    known = list[int | str]()
+    for number, part in enumerate(error["loc"], 1):
+        values = data if isinstance(data, Mapping) else dict(enumerate(data if isinstance(data, list | tuple) else ()))
+        if part in values or (error["type"] == "missing" and number == len(error["loc"])):
+            known.append(part)
+            data = values.get(part)
+    return (*known,)
 
 
 def _keys_at(model: Any, location: tuple) -> Iterable[str]:

@@ -25,7 +25,7 @@ from patchproof.base.errors import Refused
 from patchproof.base.geometry import corner_turns
 from patchproof.base.input import open_lazily, read_json
 from patchproof.base.text import printable
-from patchproof.base.validation import Finite, Positive, spelling_hint, summarize_names, validate_model
+from patchproof.base.validation import Finite, Model, Positive, spelling_hint, summarize_names, validate_model
 from patchproof.evidence.classify import BoxEdges
 from patchproof.photo.limits import run_limited
 from patchproof.photo.read import allow_heic
@@ -97,7 +97,7 @@ def load_boxes(path: str | Path, label: str) -> dict[str, Drawn]:
     in one photograph are refused, and boxes outside of it.
     """
     do = "export it again, one box a photograph"
-    coco = validate_model(_Coco, read_json(path, "boxes as COCO JSON", do), str(path))
+    coco = _read_coco(path, _Coco, "boxes as COCO JSON", do)
     category_ids = [category.id for category in coco.categories if category.name == label]
     if not category_ids and len(coco.categories) == 1:
         category_ids = [coco.categories[0].id]
@@ -158,10 +158,15 @@ def _read_csv_rows(path: str | Path) -> Iterator[tuple[str, Drawn]]:
         yield printable(name.strip().replace("\\", "/")), Drawn(numbers)
 
 
+def _read_coco(path: str | Path, model: type[Model], expected: str, do: str) -> Model:
+    if not isinstance(content := read_json(path, expected, do), dict):  # a model's results are a list of rows
+        got, do = f"{path}, a list without the photographs' names", "export annotations, not results"
+        raise Refused(expected, got, do)
+    return validate_model(model, content, str(path))
+
+
 def _read_points(path: str | Path) -> Iterator[tuple[str, Drawn]]:
-    if not isinstance(content := read_json(path, _EXPECTED, _ORDER), dict):
-        raise Refused(_EXPECTED, f"{path} without images and annotations", "export it again")
-    coco = validate_model(_CocoPoints, content, str(path))
+    coco = _read_coco(path, _CocoPoints, _EXPECTED, _ORDER)
     images = _images_by_id(coco.images, path)
     for each in coco.annotations:
         polygons = each.segmentation if isinstance(each.segmentation, tuple) else ()

@@ -43,6 +43,7 @@ MOST_NOISE = 3.0  # ΔE00 that the photograph alone makes
 _CODE_ERROR = 0.8  # of a cell, by rounding and JPEG: from 2 to 5 stops too dark it explains what a right print measures
 _LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # multiplies white noise by 6
 LEAST_FOUND = 0.35  # of the cells with detail, in their places: other designs show 0.33 at most, its own prints 0.8
+_LEAST_UNCOVERED, _LEAST_SHOWN = 0.4, 0.75  # of the same: where a fifth to a third of the design is covered
 LEAST_LIKENESS = 0.6  # correlation of structure
 _SWAPPED_BY = 0.3  # of hues' correlation: red and blue swapped beside as they are
 LEAST_INK, WEAK_INK = 0.2, 0.3  # contrast: of the strongest ink's; of chroma real prints keep 0.4, gray ones 0.04
@@ -59,6 +60,7 @@ _INK_ADVICE = "{} ink is missing or wrong, or the print is gray: check the print
 _GRAY_ADVICE = "print or photograph are gray: switch black and white off, in the printer's settings and the camera's"
 _SWAPPED_ADVICE = "red and blue are swapped: give RGB, such as array[..., ::-1] of what OpenCV reads"
 _WEAK_ADVICE = "{} ink is weak in this print: it counts, but check the printer's nozzles before you print more"
+_COVERED_ADVICE = "part of the design is covered: show all of it"
 _UNTOLD_ADVICE = "too little of the design is resolved to tell it from another: come closer"
 
 
@@ -70,9 +72,12 @@ class DesignMatch:
     trouble: PhotoRejected | None = None
     weak_ink: Remark | None = None
 
-    def trouble_beside(self, trouble: PhotoRejected | None, found: float, detailed: int) -> PhotoRejected | None:
+    def trouble_beside(
+        self, trouble: PhotoRejected | None, found: float, detailed: int, noisy: bool
+    ) -> PhotoRejected | None:
         """Return the photograph's other `trouble`, beside which only structure counts, or that the design cannot be
-        told. Raises `PhotoRejected` for another design or a missing ink. `found`: share of the `detailed` cells found.
+        told. Raises `PhotoRejected` for another design or a missing ink. `found`: share of the `detailed` cells found,
+        which noise hides, too.
         """
         # what covers markers may cover the design, and full white shows none
         if trouble is not None and trouble.code in ("too_few_markers", "clipped"):
@@ -80,6 +85,8 @@ class DesignMatch:
         own, least = self.trouble, LEAST_FOUND if detailed >= _LEAST_DETAILED else 0.0
         if own is not None and own.code != "too_small" and (trouble is None or self.likeness is not None):
             raise own
+        if trouble is None and least and not noisy and _LEAST_UNCOVERED <= found < _LEAST_SHOWN:
+            return PhotoRejected("too_few_markers", found, _LEAST_SHOWN, _COVERED_ADVICE)
         likeness = 1.0 if self.likeness is None or trouble is not None else self.likeness
         for figure, limit in ((found, least), (likeness, LEAST_LIKENESS)):
             if not figure >= limit:

@@ -142,7 +142,7 @@ def measure(
     scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi / view.step)
     counted = not page_check and scale is None
     trouble = _trouble(geometry, fit, detected, surface, found_corners)
-    color, pictures, match = None, {}, DesignMatch()
+    color, pictures, match, noisy = None, {}, DesignMatch(), False
     try:
         if page_check and surface.page_mm is not None:
             refuse_other_page(view.srgb, fit.px_from_mm, surface.page_mm, surface.label)
@@ -152,12 +152,13 @@ def measure(
         if promised is not None and surface.is_piece:
             seen = location.srgb, fit.px_from_mm, surface, promised, light, geometry, with_pictures and trouble is None
             color, pictures, match = appearance(*seen)
+            noisy = (color.noise_delta_e00 or 0) > MOST_NOISE
             if trouble is None and color.clipped_share > MOST_CLIPPED:
                 advice = "the patch is overexposed: lower the exposure by one or two steps"
                 trouble = PhotoRejected("clipped", color.clipped_share, MOST_CLIPPED, advice)
             if placed and match.likeness is None and match.trouble is None:
                 raise PhotoRejected("other_design", None, None, _PLAIN_ADVICE)
-            trouble = match.trouble_beside(trouble, *found)
+            trouble = match.trouble_beside(trouble, *found, noisy)
     except PhotoRejected as rejection:
         if corners is not None and corners.located == "corners" and rejection.code == "other_design":
             rejection = PhotoRejected("other_design", rejection.figure, rejection.threshold, _OTHER_CORNERS_ADVICE)
@@ -167,9 +168,9 @@ def measure(
     if trouble is not None:
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
-        remark, noise = _print_check(page_check, scale, scan_dpi) or match.weak_ink, color and color.noise_delta_e00
-        if remark is None and noise is not None and noise > MOST_NOISE:
-            remark = Remark(code="noisy", figure=noise, threshold=MOST_NOISE, advice=_NOISY_ADVICE)
+        remark = _print_check(page_check, scale, scan_dpi) or match.weak_ink
+        if remark is None and noisy and color is not None:
+            remark = Remark(code="noisy", figure=color.noise_delta_e00, threshold=MOST_NOISE, advice=_NOISY_ADVICE)
         scale = scale if scale is not None and _SCALE_RANGE[0] < _worst(scale) < _SCALE_RANGE[1] else None
         entry = partial(entry, status="measured", scale=scale, remark=remark)
     return MeasuredPhoto(entry(color=color), counted, pictures, light)

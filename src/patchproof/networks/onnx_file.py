@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from patchproof.base.errors import Refused
 from patchproof.networks import bounds
 from patchproof.networks.bounds import UnsupportedNetwork, checked_integer, quote
 from patchproof.networks.graph import InputDevice, Program, Step, ValueRef, mark_last_uses
@@ -109,8 +110,11 @@ class _Weights:
         data = self.read_data(location := where["location"])
         if "checksum" in where and where["checksum"].lower() != self.sha1(location):
             raise UnsupportedNetwork(f"weights in {quote(location)} whose SHA-1 is not the stated checksum")
-        offset = checked_integer(int(where.get("offset", 0)), 0, len(data))
-        size = checked_integer(int(where.get("length", len(data))), 0, len(data))
+        offset = checked_integer(int(where.get("offset", 0)), 0, 1 << 62)
+        size = checked_integer(int(where.get("length", max(len(data) - offset, 0))), 0, 1 << 62)
+        if offset + size > len(data):
+            do = "copy or download both files again: it was cut short, or is another network's"
+            raise Refused(f"{offset + size} bytes of weights in {quote(location)}", f"{len(data)} bytes", do)
         part = memoryview(data)[offset : offset + size]
         self.used_bytes[location] += len(part)
         if self.used_bytes[location] > len(data):

@@ -11,7 +11,7 @@ REJECTION_CODES = {
     "unreadable": ("no picture, damaged, or of a color space that is not read", "save it as JPEG or PNG"),
     "too_costly": ("the picture is larger than limits of size and time allow", "save it smaller"),
     "empty": ("the picture holds no pixels, or one color", "take it again"),
-    "too_few_markers": ("too little of the piece can be read to know where it lies", "show all of it, sharp and lit"),
+    "too_few_markers": ("too little of the piece is in view, uncovered and readable", "show all of it, sharp and lit"),
     "blurred": ("motion or focus merges neighboring cells of markers", "hold still, focus on it, use more light"),
     "clipped": ("highlights are cut off, so colors cannot be compared", "expose one or two stops less"),
     "noisy": ("noise or darkness alone would change colors too much", "use more light, come closer"),
