@@ -194,9 +194,11 @@ def _reason(error: ErrorDetails) -> str:
 
 def _location(error: ErrorDetails, data: Any) -> tuple[int | str, ...]:
     """Where an error is, without the kinds of value that were tried there: ("label", "str") is ("label",)."""
-    known = list[int | str]()
+    known: list[Any] = []
     for number, part in enumerate(error["loc"], 1):
-        values = data if isinstance(data, Mapping) else dict(enumerate(data if isinstance(data, list | tuple) else ()))
+        values: Any = (
+            data if isinstance(data, dict) else dict(enumerate(data if isinstance(data, list | tuple) else ()))
+        )
         if part in values or (error["type"] == "missing" and number == len(error["loc"])):
             known.append(part)
             data = values.get(part)
