@@ -80,12 +80,8 @@ def validate_model(model: type[Model], data: Any, source: str) -> Model:
         raise _explain(model, errors, data, source) from error
 
 
-_PLAIN = {
-    "a valid tuple": "a list in square brackets",
-    "tuple": "list",
-    "a valid string": "text in quotes",
-    "a valid boolean": "true or false",
-}
+_PLAIN = {"a valid tuple": "a list in square brackets", "tuple": "list"}  # pydantic's words, and a file's
+_PLAIN |= {"a valid string": "text in quotes", "a valid boolean": "true or false"}
 # a network's name: the part up to its file, and the file
 NETWORK_FILE = re.compile(r"(file:|clip:[^@:]+@|(?:torchvision|timm):[^@:]+@(?=.+\.safetensors$))(.*)", re.DOTALL)
 
