@@ -26,6 +26,7 @@ from patchproof.base.intervals import paired_difference
 from patchproof.optimizer.run import optimize
 from patchproof.report.page import draw_figure as drawing_of
 from patchproof.scene.conditions import with_values
+from undrawn import draw_nothing
 
 
 @pytest.fixture(scope="module")
@@ -215,6 +216,7 @@ BLUE = '"blue"\nmodels = ["module:fake_networks.red_against_blue"]'
 def test_where_nothing_is_left_of_the_object_the_page_says_no_gain_whatever_is_recognized(
     blue_run, tmp_path, monkeypatch
 ):
+    draw_nothing(monkeypatch)  # but the page, below
     unseen = Measurement("rejected", "too_few_markers", None)  # a search of noise for markers takes seconds
     monkeypatch.setattr(
         "patchlab.validation.envelope.sweeps.measure_photos", lambda _, __, values, ___: [[unseen]] * len(values)

@@ -21,6 +21,7 @@ from patchlab.study import study
 from patchlab.study.study import Work, load_study, run_cells, run_study
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import value_sha256
+from undrawn import draw_nothing
 
 BASE = Path(__file__).parents[1]
 
@@ -53,7 +54,8 @@ def test_a_study_leaves_json_csv_figures_and_a_page(tmp_path):
     assert "1.000 <small>[0.510, 1.000]</small>" in page and "data:image/png" in page and "http" not in page
 
 
-def test_cells_that_fail_are_reported_and_the_rest_goes_on(tmp_path):
+def test_cells_that_fail_are_reported_and_the_rest_goes_on(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     finished = carried_out(tmp_path, 13, 2, 14, 15)
     assert [one.cell.name for one in finished.results] == ["n2"]
     assert list(finished.failed) == ["n13", "n14", "n15"]
@@ -68,6 +70,7 @@ def test_where_all_cells_fail_the_page_says_so(tmp_path):
 
 
 def test_resuming_does_what_failed_changed_or_is_missing_and_nothing_else(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     carried_out(tmp_path, 2, 3, 13)
     (tmp_path / "files/n3.txt").unlink()
     done = []
@@ -83,7 +86,8 @@ def test_resuming_does_what_failed_changed_or_is_missing_and_nothing_else(tmp_pa
     assert done == ["n3", "n13", "n2"]
 
 
-def test_a_cell_cut_short_on_disk_is_done_again(tmp_path):
+def test_a_cell_cut_short_on_disk_is_done_again(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     carried_out(tmp_path, 2)
     whole = contents(tmp_path)
     (tmp_path / "cells/n2.json").write_text('{"cell": {"num')
@@ -91,7 +95,8 @@ def test_a_cell_cut_short_on_disk_is_done_again(tmp_path):
     assert contents(tmp_path) == whole
 
 
-def test_folders_settings_and_names_that_will_not_do_are_refused(tmp_path):
+def test_folders_settings_and_names_that_will_not_do_are_refused(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     carried_out(tmp_path, 2)
     with pytest.raises(Refused, match="empty or new folder"):
         carried_out(tmp_path, 2)
@@ -112,6 +117,7 @@ def test_folders_settings_and_names_that_will_not_do_are_refused(tmp_path):
 
 
 def test_studies_are_found_by_name_and_configs_read_strictly(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     monkeypatch.setitem(study.STUDIES, "toy", "toy_studies")
     with pytest.raises(Refused, match='did you mean "toy"'):
         load_study("toi")
