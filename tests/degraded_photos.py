@@ -612,9 +612,14 @@ def _exposed(light: np.ndarray, draw: Draw) -> np.ndarray:
         moved = (np.array([[1, 0, s * way[0]], [0, 1, s * way[1]]]) for s in steps)
         size = linear.shape[1::-1]
         linear = sum(cv2.warpAffine(linear, m, size, borderMode=cv2.BORDER_REPLICATE) for m in moved) / len(steps)
-    noise = draw.rng.standard_normal(linear.shape, np.float32) * np.float32(draw.noise)
-    linear = linear + noise * np.sqrt(np.maximum(linear, np.float32(0.02)))
-    return np.clip(srgb_from_linear(np.clip(linear, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)
+    noise = draw.rng.standard_normal(linear.shape, np.float32)  # of megapixels: changed where it is
+    noise *= np.float32(draw.noise)
+    noise *= np.sqrt(np.maximum(linear, np.float32(0.02)))
+    linear += noise
+    codes = srgb_from_linear(np.clip(linear, 0, 1, out=linear))
+    codes *= 255
+    codes += 0.5
+    return codes.astype(np.uint8)
 
 
 def _file(codes: np.ndarray, draw: Draw) -> bytes:

@@ -269,7 +269,7 @@ def test_without_the_flat_field_the_same_photograph_would_be_far_off(shots, read
 def test_photographs_that_show_no_chart(shots):
     _, manifest, ((shot, _), _) = shots
     small = cv2.resize(shot.srgb, (800, 600), interpolation=cv2.INTER_AREA)
-    read_chart(Photo(small, None), manifest)
+    paper = read_chart(Photo(small, None), manifest).paper
     with pytest.raises(PhotoRejected, match="too_few_markers"):
         read_chart(Photo(np.full_like(small, 90), None), manifest)
     with pytest.raises(PhotoRejected, match="mirrored"):
@@ -278,7 +278,6 @@ def test_photographs_that_show_no_chart(shots):
     white = Photo((srgb_from_linear(light.clip(0, 1)) * 255).astype(np.uint8), None)
     with pytest.raises(PhotoRejected, match=r"clipped|too_few"):
         read_chart(white, manifest)
-    paper = read_chart(Photo(small, None), manifest).paper
     for share in (0.15, 0.1):
         light = linear_from_srgb(small / 255) * share / np.mean(paper)
         dark = Photo((srgb_from_linear(light) * 255 + 0.5).astype(np.uint8), None)

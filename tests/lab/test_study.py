@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import toy_studies as toy
@@ -151,24 +153,22 @@ def test_listing_the_studies_imports_none_of_them():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
+def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path, monkeypatch):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     settings = toy.ToySettings(numbers=tuple(range(20, 32)))
     run_cells(toy.STUDY, settings, BASE, whole, Work(jobs=2))
-    code = (
-        f"import sys; sys.path.insert(0, {str(BASE)!r})\n"
-        "import time\nfrom pathlib import Path\nfrom types import SimpleNamespace\n"
-        "import toy_studies as toy\nfrom patchlab.study.study import run_cells\n"
-        "toy.time = SimpleNamespace(sleep=lambda _, wait=time.sleep: wait(0.2))\n"  # only here: time for a kill
-        f"settings = toy.ToySettings.model_validate_json({settings.model_dump_json()!r})\n"
-        f"run_cells(toy.STUDY, settings, Path({str(BASE)!r}), {str(killed)!r})"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code])
+    child = os.fork()
+    if child == 0:
+        try:
+            monkeypatch.setattr(toy, "time", SimpleNamespace(sleep=lambda _: time.sleep(0.2)))  # time for a kill
+            run_cells(toy.STUDY, settings, BASE, killed, Work())
+        finally:
+            os._exit(1)
     while len(list(killed.glob("cells/*.json"))) < 3:
-        assert process.poll() is None
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
         time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
     assert len(list(killed.glob("cells/*.json"))) < 12
     run_cells(toy.STUDY, settings, BASE, killed, Work(resume=True))
     assert contents(killed) == contents(whole)
