@@ -250,7 +250,7 @@ def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, shipped, two_stag
             "target": {"label": "box truck", "models": names, "least_score": 0.4},
             "background": {"color": [0.5, 0.5, 0.5]},
             "camera": {"photo_px": [320, 240]},
-            "optimize": {"steps": 4, "views": 2},
+            "optimize": {"steps": 2, "views": 2},
         }
     )
     run = pp.optimize(scene, tmp_path / "run", promise=pp.PromiseOptions(8, ("bare",)))
