@@ -488,12 +488,11 @@ def take(kind: str, seed: int) -> tuple[Degraded, Surface, PromisedColors]:
         return _projected(draw, draw.place(mm * draw.stretch), camera_from_page, wobble)[0]
 
     light = _background(draw)
-    light = _laid_on(
-        light, page, *_projected(draw, draw.place((_samples() - CENTER) * draw.stretch), draw.camera_from_page, wobble)
-    )
+    samples = _samples() if np.all(draw.stretch == 1) else _samples() * draw.stretch
+    light = _laid_on(light, page, *_projected(draw, draw.place(samples), draw.camera_from_page, wobble))
     if draw.twin is not None:
         page = printed(draw.bends, DESIGNS[draw.design](), draw.twin_sheet).reshape(-1, 3)
-        light = _laid_on(light, page, *_projected(draw, flat(_samples() - CENTER), draw.twin, wobble))
+        light = _laid_on(light, page, *_projected(draw, flat(_samples()), draw.twin, wobble))
     for change in draw.on_light:
         light = change(light)
     codes = _exposed(light, draw)
@@ -524,8 +523,9 @@ def _page(draw: Draw) -> np.ndarray:
 
 @cache
 def _samples() -> np.ndarray:
+    """Page millimeters N×2 from the sheet's middle."""
     size = round(SIDE_MM * PAGE_PER_MM)
-    return ((np.mgrid[:size, :size][::-1].reshape(2, -1) + 0.5) / PAGE_PER_MM).T
+    return ((np.mgrid[:size, :size][::-1].reshape(2, -1) + 0.5) / PAGE_PER_MM).T - CENTER
 
 
 def _projected(draw: Draw, points: np.ndarray, camera_from_page, wobble) -> tuple[np.ndarray, np.ndarray]:

@@ -285,8 +285,16 @@ def test_photographs_that_show_no_chart(shots):
             read_chart(dark, manifest)
 
 
-def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
+def test_a_printer_is_calibrated_stored_and_loaded(shots, readings, tmp_path, capsys, monkeypatch):
     printer, manifest, both = shots
+
+    def read_before(photo, of_chart):
+        assert of_chart == manifest
+        return next(
+            read for (shot, _), read in zip(both, readings, strict=True) if np.array_equal(photo.srgb, shot.srgb)
+        )
+
+    monkeypatch.setattr(chart_module, "read_chart", read_before)
     (tmp_path / "chart.json").write_text(dump_manifest(manifest), encoding="utf-8")
     for i, (shot, _) in enumerate(both):
         Image.fromarray(shot.srgb).save(tmp_path / f"{i}.png")
