@@ -488,12 +488,11 @@ def take(kind: str, seed: int) -> tuple[Degraded, Surface, PromisedColors]:
         return _projected(draw, draw.place(mm * draw.stretch), camera_from_page, wobble)[0]
 
     light = _background(draw)
-    light = _laid_on(
-        light, page, *_projected(draw, draw.place((_samples() - CENTER) * draw.stretch), draw.camera_from_page, wobble)
-    )
+    samples = _samples() if np.all(draw.stretch == 1) else _samples() * draw.stretch
+    light = _laid_on(light, page, *_projected(draw, draw.place(samples), draw.camera_from_page, wobble))
     if draw.twin is not None:
         page = printed(draw.bends, DESIGNS[draw.design](), draw.twin_sheet).reshape(-1, 3)
-        light = _laid_on(light, page, *_projected(draw, flat(_samples() - CENTER), draw.twin, wobble))
+        light = _laid_on(light, page, *_projected(draw, flat(_samples()), draw.twin, wobble))
     for change in draw.on_light:
         light = change(light)
     codes = _exposed(light, draw)
@@ -524,8 +523,9 @@ def _page(draw: Draw) -> np.ndarray:
 
 @cache
 def _samples() -> np.ndarray:
+    """Page millimeters N×2 from the sheet's middle."""
     size = round(SIDE_MM * PAGE_PER_MM)
-    return ((np.mgrid[:size, :size][::-1].reshape(2, -1) + 0.5) / PAGE_PER_MM).T
+    return ((np.mgrid[:size, :size][::-1].reshape(2, -1) + 0.5) / PAGE_PER_MM).T - CENTER
 
 
 def _projected(draw: Draw, points: np.ndarray, camera_from_page, wobble) -> tuple[np.ndarray, np.ndarray]:
@@ -612,9 +612,14 @@ def _exposed(light: np.ndarray, draw: Draw) -> np.ndarray:
         moved = (np.array([[1, 0, s * way[0]], [0, 1, s * way[1]]]) for s in steps)
         size = linear.shape[1::-1]
         linear = sum(cv2.warpAffine(linear, m, size, borderMode=cv2.BORDER_REPLICATE) for m in moved) / len(steps)
-    noise = draw.rng.standard_normal(linear.shape, np.float32) * np.float32(draw.noise)
-    linear = linear + noise * np.sqrt(np.maximum(linear, np.float32(0.02)))
-    return np.clip(srgb_from_linear(np.clip(linear, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)
+    noise = draw.rng.standard_normal(linear.shape, np.float32)  # of megapixels: changed where it is
+    noise *= np.float32(draw.noise)
+    noise *= np.sqrt(np.maximum(linear, np.float32(0.02)))
+    linear += noise
+    codes = srgb_from_linear(np.clip(linear, 0, 1, out=linear))
+    codes *= 255
+    codes += 0.5
+    return codes.astype(np.uint8)
 
 
 def _file(codes: np.ndarray, draw: Draw) -> bytes:

@@ -76,8 +76,9 @@ def photograph(design: np.ndarray | None, width_px: float, rng: np.random.Genera
     corners = seen[:, :2] / seen[:, 2:]
     if design is not None:
         zoom = max(1, round(2 * FINE * width_px / len(design)))
-        sent = torch.tensor(design.repeat(zoom, 0).repeat(zoom, 1) / 255.0, dtype=torch.float32).permute(2, 0, 1)[None]
+        sent = torch.tensor(design / 255.0, dtype=torch.float32).permute(2, 0, 1)[None]
         paper = linear_from_srgb(load_printer("office").apply(sent)[0].permute(1, 2, 0).numpy()).astype(np.float32)
+        paper = paper.repeat(zoom, 0).repeat(zoom, 1)
         low = np.maximum(np.floor(corners.min(0)).astype(int) - 4, 0)
         size = np.minimum(np.ceil(corners.max(0)).astype(int) + 4, SIZE_PX) - low
         outline = rect_corners((0, 0, *paper.shape[1::-1])).astype(np.float32) - 0.5

@@ -148,9 +148,13 @@ def photograph(page, px_from_mm, size_px=(1200, 900), blur_px=0.0, noise=0.0, li
     to_index = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
     matrix = to_index @ raster_from_px @ to_px
     flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    size = (width * fine, height * fine)
-    fine_linear = cv2.warpPerspective(page, matrix, size, None, flags, cv2.BORDER_CONSTANT, (0.2, 0.2, 0.2))
-    linear = cv2.resize(fine_linear, size_px, interpolation=cv2.INTER_AREA) * light
+    linear = np.empty((height, width, 3), np.float32)
+    for first in range(0, height, 60):  # rows at a time that a processor's own memory holds
+        rows = min(60, height - first)
+        down, size = np.array([[1, 0, 0], [0, 1, first * fine], [0, 0, 1.0]]), (width * fine, rows * fine)
+        seen = cv2.warpPerspective(page, matrix @ down, size, None, flags, cv2.BORDER_CONSTANT, (0.2, 0.2, 0.2))
+        linear[first : first + rows] = cv2.resize(seen, (width, rows), interpolation=cv2.INTER_AREA)
+    linear = linear * light
     if blur_px > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), blur_px)
     if noise:

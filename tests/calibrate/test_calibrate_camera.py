@@ -163,7 +163,7 @@ def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("boards")
     board_sheet("charuco_a4", folder / "board.pdf")
     page = rasterize_page(folder / "board.pdf", 1, 127).astype(np.float32) / 255  # 5 px per mm
-    size, fine, camera, bends = (640, 480), 3, matrix(560.0, (316.0, 244.0)), np.array([-0.12, 0, 0, 0, 0])
+    size, fine, camera, bends = (640, 480), 2, matrix(560.0, (316.0, 244.0)), np.array([-0.12, 0, 0, 0, 0])
     x, y = np.meshgrid(*((np.arange(side * fine) + 0.5) / fine for side in size))
     straight = cv2.undistortPoints(np.stack([x.ravel(), y.ravel()], 1).reshape(-1, 1, 2), camera, bends).reshape(-1, 2)
     rng = np.random.default_rng(3)

@@ -85,9 +85,10 @@ def test_mottle_is_as_strong_as_it_says_on_ink_and_is_not_on_paper(tmp_path):
         views = render_views(stage, picture, conditions, (side_px, side_px))
         seen, whole = shade(views, picture), views.on_piece.share[:, 0] > 0.99
         rows = seen.permute(0, 2, 3, 1).reshape(-1, 3)[views.on_piece.pixel[whole]]
-        return [srgb_from_linear(rows[views.on_piece.view[whole] == view]) for view in range(3)]
+        return [srgb_from_linear(rows[views.on_piece.view[whole] == view]) for view in range(len(conditions))]
 
-    shifts = [on - off for on, off in zip(shown(gray, uneven), shown(gray, plain), strict=True)]
+    (off,) = shown(gray, plain[:1])  # as the others
+    shifts = [on - off for on in shown(gray, uneven)]
     rms = [float(shift.square().mean().sqrt()) for shift in shifts]
     assert rms == pytest.approx([0.02, 0.02, 0.06], rel=0.08)  # cells are several pixels wide
     assert torch.equal(shifts[0], shifts[1])  # one print of a session, twice

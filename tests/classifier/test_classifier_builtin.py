@@ -9,7 +9,7 @@ import torch
 
 from patchlab.training import pictures as rendered
 from patchlab.training import train_builtin
-from patchlab.training.fit import Seconds
+from patchlab.training.fit import Seconds, export_onnx
 from patchlab.training.pictures import HELD_OUT_SEED, Pictures, augment, render_pictures, shrink_pictures
 from patchproof.base.errors import Refused
 from patchproof.classifier import find_labels, load_classifier
@@ -27,8 +27,8 @@ def builtin():
 @pytest.fixture(scope="module")
 def fresh() -> Pictures:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rendered, "VIEWS_PER_SHAPE", 4)
-        return render_pictures(4, FRESH, INPUT_PX)
+        patch.setattr(rendered, "VIEWS_PER_SHAPE", 2)
+        return render_pictures(2, FRESH, INPUT_PX)
 
 
 def test_it_names_the_primitives_and_is_small(builtin):
@@ -45,7 +45,7 @@ def test_it_knows_fresh_renders_about_as_well_as_its_card_says(builtin, fresh):
     with torch.no_grad():
         logits = builtin.logits(images.float() / 255)
     right = (logits.argmax(1) == labels).float().mean()
-    # four views of one shape are alike, so this share scatters by about 0.05 on other seeds
+    # two views of one shape are alike, so this share scatters by about 0.05 on other seeds
     assert right > card["held_out_accuracy"] - 0.15
     # room left for gradients: label smoothing of 0.1 aims at 0.91
     assert np.median(builtin.confidence(logits, range(12)).numpy()) == pytest.approx(1)
@@ -59,9 +59,9 @@ def test_missing_weights_are_refused(tmp_path):
 
 def test_pictures_are_repeatable_and_follow_the_seed(fresh, monkeypatch):
     images, labels, boxes = fresh
-    assert images.dtype == torch.uint8 and images.shape == (48, 3, 96, 96)
-    assert torch.equal(labels.bincount(), torch.full((12,), 4))
-    assert boxes.shape == (48, 4) and bool((boxes[:, 2:] > boxes[:, :2]).all())
+    assert images.dtype == torch.uint8 and images.shape == (24, 3, 96, 96)
+    assert torch.equal(labels.bincount(), torch.full((12,), 2))
+    assert boxes.shape == (24, 4) and bool((boxes[:, 2:] > boxes[:, :2]).all())
     assert (images.float().std((1, 2, 3)) > 1).all()  # none is blank
     names = primitives.primitive_names()[:3]
     monkeypatch.setattr(primitives, "primitive_names", lambda: names)
@@ -121,6 +121,8 @@ def test_another_network_learns_by_the_same_command_from_pictures_that_are_kept(
     more = ("--pictures", str(tmp_path / "kept"), "--batch", "8", "--learning-rate", "0.1")
     network = ("--network", "fake_networks.MeanColor", "--settings", '{"steep": 2}', "--input-px", "32")
     for name, epochs in (("first", "1"), ("colors", "12")):
+        # the first is of no use but for its pictures, and torch's exporter takes a second
+        monkeypatch.setattr(train_builtin, "export_onnx", export_onnx if name == "colors" else lambda *_: 0)
         named = ["train_builtin", "--out", str(tmp_path), "--name", name, "--epochs", epochs]
         command = [*named, "--pasted", "0", *network, *more]
         monkeypatch.setattr("sys.argv", command)

@@ -18,6 +18,7 @@ from patchlab.study import measure
 from patchlab.study.study import Cell, Result, Work
 from patchproof.base.errors import Refused
 from patchproof.report.page import draw_figure
+from undrawn import draw_once
 
 OUT = Path()
 
@@ -164,6 +165,7 @@ def test_promises_of_copies_miss_and_others_hold():
 
 
 def test_a_killed_chart_is_resumed_to_the_same_bytes(tmp_path, monkeypatch):
+    draw_once(monkeypatch)
     monkeypatch.setattr(breaks, "PROBES", breaks.PROBES[-2:])
     monkeypatch.setitem(make._QUICK, "breaks", {"draws": 2})
     finished = make.make_charts("breaks", tmp_path, True)["breaks"]

@@ -26,6 +26,7 @@ from patchproof.base.intervals import paired_difference
 from patchproof.optimizer.run import optimize
 from patchproof.report.page import draw_figure as drawing_of
 from patchproof.scene.conditions import with_values
+from undrawn import draw_nothing
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +126,7 @@ def test_measuring_works_at_the_easy_end_and_says_why_not_at_the_hard_one(world,
 
 
 def test_points_see_common_conditions_whatever_their_neighbors_are(world, drawn):
-    for axis, values, some in (("distance", (600.0, 4000.0), drawn), ("jpeg", (90.0, 2.0), drawn[:1])):
+    for axis, values, some in (("distance", (600.0, 4000.0), drawn[:2]), ("jpeg", (90.0, 2.0), drawn[:1])):
         together = recognize_target(world, axis, values, some)
         alone = [recognize_target(world, axis, [value], some) for value in values]
         assert list(together) == ["design", "bare", "gray"]
@@ -215,13 +216,14 @@ BLUE = '"blue"\nmodels = ["module:fake_networks.red_against_blue"]'
 def test_where_nothing_is_left_of_the_object_the_page_says_no_gain_whatever_is_recognized(
     blue_run, tmp_path, monkeypatch
 ):
+    draw_nothing(monkeypatch)  # but the page, below
     unseen = Measurement("rejected", "too_few_markers", None)  # a search of noise for markers takes seconds
     monkeypatch.setattr(
         "patchlab.validation.envelope.sweeps.measure_photos", lambda _, __, values, ___: [[unseen]] * len(values)
     )
     config, out = tmp_path / "envelope.toml", tmp_path / "out"
     config.write_text(
-        f'run = "{blue_run}"\nn = 8\nphotos = 1\n'
+        f'run = "{blue_run}"\nn = 6\nphotos = 1\n'
         'sweeps = [{axis = "noise", points = 3}, {axis = "blur", easy = 0.1, hard = 60, points = 3}]\n'
     )
     finished = run_study("envelope", config, out)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import toy_studies as toy
@@ -21,6 +23,7 @@ from patchlab.study import study
 from patchlab.study.study import Work, load_study, run_cells, run_study
 from patchproof.base.errors import Refused
 from patchproof.base.fingerprint import value_sha256
+from undrawn import draw_nothing
 
 BASE = Path(__file__).parents[1]
 
@@ -53,7 +56,8 @@ def test_a_study_leaves_json_csv_figures_and_a_page(tmp_path):
     assert "1.000 <small>[0.510, 1.000]</small>" in page and "data:image/png" in page and "http" not in page
 
 
-def test_cells_that_fail_are_reported_and_the_rest_goes_on(tmp_path):
+def test_cells_that_fail_are_reported_and_the_rest_goes_on(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     finished = carried_out(tmp_path, 13, 2, 14, 15)
     assert [one.cell.name for one in finished.results] == ["n2"]
     assert list(finished.failed) == ["n13", "n14", "n15"]
@@ -68,6 +72,7 @@ def test_where_all_cells_fail_the_page_says_so(tmp_path):
 
 
 def test_resuming_does_what_failed_changed_or_is_missing_and_nothing_else(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     carried_out(tmp_path, 2, 3, 13)
     (tmp_path / "files/n3.txt").unlink()
     done = []
@@ -83,7 +88,8 @@ def test_resuming_does_what_failed_changed_or_is_missing_and_nothing_else(tmp_pa
     assert done == ["n3", "n13", "n2"]
 
 
-def test_a_cell_cut_short_on_disk_is_done_again(tmp_path):
+def test_a_cell_cut_short_on_disk_is_done_again(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     carried_out(tmp_path, 2)
     whole = contents(tmp_path)
     (tmp_path / "cells/n2.json").write_text('{"cell": {"num')
@@ -91,7 +97,8 @@ def test_a_cell_cut_short_on_disk_is_done_again(tmp_path):
     assert contents(tmp_path) == whole
 
 
-def test_folders_settings_and_names_that_will_not_do_are_refused(tmp_path):
+def test_folders_settings_and_names_that_will_not_do_are_refused(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     carried_out(tmp_path, 2)
     with pytest.raises(Refused, match="empty or new folder"):
         carried_out(tmp_path, 2)
@@ -112,6 +119,7 @@ def test_folders_settings_and_names_that_will_not_do_are_refused(tmp_path):
 
 
 def test_studies_are_found_by_name_and_configs_read_strictly(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     monkeypatch.setitem(study.STUDIES, "toy", "toy_studies")
     with pytest.raises(Refused, match='did you mean "toy"'):
         load_study("toi")
@@ -145,24 +153,22 @@ def test_listing_the_studies_imports_none_of_them():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
+def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path, monkeypatch):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     settings = toy.ToySettings(numbers=tuple(range(20, 32)))
     run_cells(toy.STUDY, settings, BASE, whole, Work(jobs=2))
-    code = (
-        f"import sys; sys.path.insert(0, {str(BASE)!r})\n"
-        "import time\nfrom pathlib import Path\nfrom types import SimpleNamespace\n"
-        "import toy_studies as toy\nfrom patchlab.study.study import run_cells\n"
-        "toy.time = SimpleNamespace(sleep=lambda _, wait=time.sleep: wait(0.2))\n"  # only here: time for a kill
-        f"settings = toy.ToySettings.model_validate_json({settings.model_dump_json()!r})\n"
-        f"run_cells(toy.STUDY, settings, Path({str(BASE)!r}), {str(killed)!r})"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code])
+    child = os.fork()
+    if child == 0:
+        try:
+            monkeypatch.setattr(toy, "time", SimpleNamespace(sleep=lambda _: time.sleep(0.2)))  # time for a kill
+            run_cells(toy.STUDY, settings, BASE, killed, Work())
+        finally:
+            os._exit(1)
     while len(list(killed.glob("cells/*.json"))) < 3:
-        assert process.poll() is None
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
         time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
     assert len(list(killed.glob("cells/*.json"))) < 12
     run_cells(toy.STUDY, settings, BASE, killed, Work(resume=True))
     assert contents(killed) == contents(whole)

@@ -36,20 +36,21 @@ def test_nothing_to_estimate_is_no_figure():
 
 
 def test_a_cell_goes_from_the_scene_to_effects(tmp_path, monkeypatch):
-    (one,) = small_study("effects", tmp_path, monkeypatch, 2).results
-    assert len(one.answers["sessions"]) == 2
-    for session in one.answers["sessions"]:
-        assert session["photographed"] is not None and 0 < session["photos"] <= 5
-        assert session["agree"] is None or 0 <= session["agree"] <= 1
+    (one,) = small_study("effects", tmp_path, monkeypatch, 1).results
+    (session,) = one.answers["sessions"]
+    assert session["photographed"] is not None and 0 < session["photos"] <= 5
+    assert session["agree"] is None or 0 <= session["agree"] <= 1
 
 
-def test_photographs_of_one_session_are_verified_too(tmp_path, monkeypatch):
+@pytest.mark.parametrize("sessions", [[""], ["session_1", "session_2"]])
+def test_photographs_of_each_session_are_verified_beside_those_of_the_control(sessions, tmp_path, monkeypatch):
     """One session's photographs lie in the folder itself, in no folder of a session."""
     verified = []
     folders = {None: tmp_path / "photos", "gray": tmp_path / "gray"}
     for folder in folders.values():
-        folder.mkdir()
-        (folder / "photo_0001.jpg").write_bytes(b"")
+        for name in sessions:
+            (folder / name).mkdir(parents=True)
+            (folder / name / "photo_0001.jpg").write_bytes(b"")
     monkeypatch.setattr(photo_sessions, "make_run_and_sheet", lambda base, cell, folder: None)
     monkeypatch.setattr(
         photo_sessions, "take_photos", lambda settings, cell, run, folder, control=None: folders[control]
@@ -60,4 +61,5 @@ def test_photographs_of_one_session_are_verified_too(tmp_path, monkeypatch):
     monkeypatch.setattr(effects, "_record_session", lambda report, control: session())
     monkeypatch.setattr(photo_sessions, "record_promise", lambda run: {})
     answers = effects.run(SETTINGS, tmp_path, Cell("a", {}))
-    assert len(answers["sessions"]) == 1 and verified == [(folders[None], folders["gray"])]
+    assert verified == [(folders[None] / name, folders["gray"] / name) for name in sessions]
+    assert len(answers["sessions"]) == len(sessions)

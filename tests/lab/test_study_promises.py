@@ -14,6 +14,7 @@ from patchproof.base.sessions import rate_posterior
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.promise import VIEWS_PER_SESSION
 from test_optimize import SCENE
+from undrawn import draw_nothing
 
 
 def result(scene, *sessions, hits=320, n=400):
@@ -92,6 +93,7 @@ def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
 
 
 def test_a_picture_made_elsewhere_takes_the_place_of_a_design(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     Image.new("RGB", (48, 48), (220, 30, 30)).save(tmp_path / "red.png")
     finished = small_study("promises", tmp_path, monkeypatch, 1, 'pictures = {scene = ["red.png"]}\n')
     (only,) = finished.results

@@ -32,6 +32,7 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.scene.scene import load_scene
 from test_textures_optimized import scene_file
+from undrawn import draw_nothing
 
 RED, BLUE = "module:fake_networks.red_against_blue", "module:fake_networks.blue_against_red"
 CORNER = "module:fake_networks.corner"
@@ -160,7 +161,8 @@ def test_every_network_is_in_one_family():
             )
 
 
-def test_a_study_finds_what_optimize_and_evaluate_find_and_no_gain_of_a_design_that_did_not_move(tmp_path):
+def test_a_study_finds_what_optimize_and_evaluate_find_and_no_gain_of_a_design_that_did_not_move(tmp_path, monkeypatch):
+    draw_nothing(monkeypatch)
     ways = '[ways.as_is]\n[ways.still]\noptimize = {optimizer = "sign", step_size = 1e-6}\n'
     config = written(tmp_path, "carton", f'networks = ["builtin"]\nn = 4\nlights = 1\nseeds = [3]\n{ways}')
     finished = run_study("transfer", config, tmp_path / "out")

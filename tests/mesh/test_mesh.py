@@ -512,7 +512,7 @@ def test_long_words_and_long_headers_take_neither_memory_nor_minutes(tmp_path):
 
 
 def test_an_outline_that_has_few_ears_ends(tmp_path, monkeypatch):
-    monkeypatch.setattr(mesh_loader, "SECONDS", 0.5)
+    monkeypatch.setattr(mesh_loader, "SECONDS", 0.2)
     corners = np.random.default_rng(0).random((999, 2))
     text = "".join(f"v {x} {y} 0\n" for x, y in corners) + f"f {' '.join(map(str, range(1, 1000)))}\n" * 20
     refused(write(tmp_path, "a.obj", text), "a.obj", "processor time")

@@ -50,7 +50,7 @@ def wall() -> tuple[np.ndarray, np.ndarray]:
     """A rough wall, `FINE` times as large as photographs are, and their noise."""
     rng = np.random.default_rng(0)
     walls = [cv2.resize(rng.uniform(60, 190, (n, n, 3)), SIZE_PX, interpolation=cv2.INTER_CUBIC) for n in (6, 30, 120)]
-    return cv2.resize(np.mean(walls, 0), None, fx=FINE, fy=FINE), rng.normal(0, 2, (*SIZE_PX[::-1], 3))
+    return cv2.resize(np.mean(walls, 0, np.float32), None, fx=FINE, fy=FINE), rng.normal(0, 2, (*SIZE_PX[::-1], 3))
 
 
 def photograph(*prints: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -58,12 +58,14 @@ def photograph(*prints: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     picture, noise = wall()
     for design, corners_px in prints:
         codes = cv2.resize(design, (240, 240), interpolation=cv2.INTER_NEAREST) / 255.0
-        codes = 255 * (0.12 + 0.7 * (0.6 * codes + 0.4 * codes.mean(2, keepdims=True)) ** 1.4)
+        codes = (255 * (0.12 + 0.7 * (0.6 * codes + 0.4 * codes.mean(2, keepdims=True)) ** 1.4)).astype(np.float32)
         outline = np.array([[0, 0], [240, 0], [240, 240], [0, 240]], np.float32)
         to_px = cv2.getPerspectiveTransform(outline - 0.5, (FINE * corners_px - 0.5).astype(np.float32))
         size = picture.shape[1::-1]
         inside = cv2.warpPerspective(np.ones((240, 240), np.float32), to_px, size)[..., None]
-        picture = picture * (1 - inside) + inside * cv2.warpPerspective(codes, to_px, size, borderMode=1)
+        picture = picture * (1 - inside) + inside * cv2.warpPerspective(
+            codes.astype(np.float32), to_px, size, borderMode=1
+        )
     picture = cv2.GaussianBlur(cv2.resize(picture, SIZE_PX, interpolation=cv2.INTER_AREA), (0, 0), 0.7)
     return np.clip(picture + noise, 0, 255).round().astype(np.uint8)
 

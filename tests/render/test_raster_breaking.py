@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
-import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
 
 from patchproof.base.errors import Refused
+from patchproof.base.input import run_in_child
 from patchproof.render import raster
 from patchproof.render.fragments import Cameras
 from patchproof.render.raster import rasterize
@@ -176,19 +178,20 @@ def test_five_full_pictures_of_a_megapixel_stay_below_400_megabytes():
     """In a process of its own: 5.2 million fragments of 41 bytes, and chunks."""
     if not sys.platform.startswith("linux"):
         pytest.skip("peak memory is read from Linux's /proc")
-    code = """
-import torch
-from patchproof.render.fragments import Cameras
-from patchproof.render.raster import rasterize
-corners = torch.tensor([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=torch.float64)
-pose, matrix = torch.eye(4, dtype=torch.float64), torch.tensor([[512.0, 0, 512], [0, 512, 512], [0, 0, 1]])
-memory = lambda: next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1]
-before = int(memory())  # torch's own libraries: those for GPUs take three times as much
-views = Cameras(pose.expand(5, 4, 4), matrix.double().expand(5, 3, 3), (1024, 1024))
-count = len(rasterize(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), views, 0.1))
-print(count, (int(memory()) - before) // 1024)
-"""
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    count, peak_mb = (int(word) for word in out.split())
+    pose, matrix = torch.eye(4, dtype=torch.float64), torch.tensor([[512.0, 0, 512], [0, 512, 512], [0, 0, 1]])
+    views = Cameras(pose.expand(5, 4, 4), matrix.double().expand(5, 3, 3), (1024, 1024))
+    corners = torch.tensor([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=torch.float64)
+
+    def peak_kb() -> int:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+
+    def drawn() -> tuple[int, int]:
+        before = peak_kb()  # a fork's peak begins at what it has
+        count = len(rasterize(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), views, 0.1))
+        return count, (peak_kb() - before) // 1024
+
+    ctypes.CDLL(None).malloc_trim(0)  # memory that other tests freed would not count
+    count, peak_mb = run_in_child(drawn)
     assert count == 5 * 1024**2
-    assert peak_mb < 400  # 286 measured
+    assert 200 < peak_mb < 400  # 311 measured, the fragments alone are 205
