@@ -60,7 +60,7 @@ def here(tmp_path_factory):
 def test_commands(here, monkeypatch, capsys):
     monkeypatch.chdir(here)
     # fewer than a user would ask for
-    lines = re.sub(r"--n \d+ --sessions \d+", "--n 2 --sessions 2", blocks("console")[0]).replace("--n 100", "--n 4")
+    lines = re.sub(r"--n \d+ --sessions \d+", "--n 1 --sessions 1", blocks("console")[0]).replace("--n 100", "--n 4")
     for line in lines.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "patchproof"
@@ -101,7 +101,7 @@ def test_python(here, monkeypatch, capsys):
     (code,) = blocks("python")
     assert sum(bool(line.strip()) for line in code.splitlines()) <= 8
     monkeypatch.chdir(here)
-    fewer = code.replace('"truck")', '"truck", draft=True)').replace("48,", "4,").replace("sessions=12", "sessions=4")
+    fewer = code.replace('"truck")', '"truck", draft=True)').replace("48,", "2,").replace("sessions=12", "sessions=2")
     assert len(fewer) == len(code) + len(", draft=True") - 2
     monkeypatch.setattr("patchproof.optimizer.run.DRAFT_EFFORT", (1, 8))
     exec(compile(fewer, "README.md", "exec"), {})
