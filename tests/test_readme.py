@@ -41,7 +41,8 @@ def blocks(language: str) -> list[str]:
 
 @pytest.fixture(autouse=True)
 def few_views(monkeypatch):
-    """Of a promise and of the selection set: what they cost is time."""
+    """Of a promise and of the selection set, and no chances of numbers to advise: what they cost is time."""
+    monkeypatch.setattr("patchproof.evidence.verdict.kept_chance", lambda *_: 0.9)
     monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 16)
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
 
@@ -50,9 +51,12 @@ def few_views(monkeypatch):
 def here(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
     toml = blocks("toml")[0]
-    # fewer steps and smaller photographs than a user would take
+    # fewer steps and smaller photographs than a user would take, before gray
     (folder / "scene.toml").write_text(
-        toml + "\n[optimize]\nsteps = 3\nviews = 2\n[camera]\nphoto_px = [800, 600]\n", encoding="utf-8"
+        toml
+        + "\n[optimize]\nsteps = 3\nviews = 2\n[camera]\nphoto_px = [800, 600]\n"
+        + "[background]\ncolor = [0.5, 0.5, 0.5]\n",
+        encoding="utf-8",
     )
     return folder
 

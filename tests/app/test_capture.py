@@ -469,35 +469,34 @@ def test_the_command_line_has_it_without_the_libraries():
     assert done.returncode == 0 and "--lan" in done.stdout
 
 
-def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tmp_path, sheet, photos):
+def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tmp_path, sheet, photos, browser):
     taken = tmp_path / "IMG.jpg"
     taken.write_bytes(photos[2])
     dark = tmp_path / "dark.jpg"
     dark.write_bytes(photos[3])
     with gathered_in(tmp_path / "photos", sheet) as gathered, listening(gathered) as address:
-        with Browser(tmp_path) as browser:
-            browser.call("Page.navigate", url=address)
-            browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
-            browser.choose("#camera", taken)
-            said = browser.wait_for("document.querySelector('#answer').innerText")
-            assert said.startswith("recognized as bright") and "session_01/photo_0001.jpg" in said
-            assert browser.evaluate("document.querySelector('#answer img').naturalWidth") > 300
-            assert browser.evaluate("document.querySelector('#latest').innerText") == ""  # said once
-            browser.call(
-                "Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0
-            )
-            browser.choose("#camera", dark)
-            browser.wait_for("document.querySelector('#queue').innerText.includes('not sent yet')")
-            browser.call(
-                "Network.emulateNetworkConditions", offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1
-            )
-            assert browser.wait_for("document.querySelector('#answer b').innerText == 'not recognized'")
-            assert browser.evaluate("document.querySelector('#queue').childElementCount") == 0
-            assert browser.evaluate("document.documentElement.scrollWidth") == 390
-            assert {urlsplit(url).netloc for url in browser.requested if url.startswith("http")} == {
-                urlsplit(address).netloc
-            }
-            assert not [t for t in browser.troubles if "ERR_INTERNET_DISCONNECTED" not in json.dumps(t)]
+        browser.call("Page.navigate", url=address)
+        browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
+        browser.choose("#camera", taken)
+        said = browser.wait_for("document.querySelector('#answer').innerText")
+        assert said.startswith("recognized as bright") and "session_01/photo_0001.jpg" in said
+        assert browser.evaluate("document.querySelector('#answer img').naturalWidth") > 300
+        assert browser.evaluate("document.querySelector('#latest').innerText") == ""  # said once
+        browser.call(
+            "Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0
+        )
+        browser.choose("#camera", dark)
+        browser.wait_for("document.querySelector('#queue').innerText.includes('not sent yet')")
+        browser.call(
+            "Network.emulateNetworkConditions", offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1
+        )
+        assert browser.wait_for("document.querySelector('#answer b').innerText == 'not recognized'")
+        assert browser.evaluate("document.querySelector('#queue').childElementCount") == 0
+        assert browser.evaluate("document.documentElement.scrollWidth") == 390
+        assert {urlsplit(url).netloc for url in browser.requested if url.startswith("http")} == {
+            urlsplit(address).netloc
+        }
+        assert not [t for t in browser.troubles if "ERR_INTERNET_DISCONNECTED" not in json.dumps(t)]
     assert files_in(tmp_path / "photos")[1:] == ["session_01/photo_0001.jpg", "session_01/photo_0002.jpg"]
     assert set(CONTROLS) == {"bare", "mean", "gray", "noise", "blank"}
 
@@ -626,6 +625,20 @@ def bare(tmp_path_factory) -> tuple[Path, Path]:
     return folder / "sheet.json", save(photograph(page, PX_FROM_MM, SIZE_PX, noise=0.004, fine=2), folder / "a.jpg")
 
 
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory):
+    with Browser(tmp_path_factory.mktemp("browser")) as begun:
+        yield begun
+
+
+@pytest.fixture
+def browser(chromium):
+    """One for all pages, each of which it forgets: to begin takes it longer than a page does."""
+    yield chromium
+    chromium.call("Page.navigate", url="about:blank")  # which asks no server that has ended
+    chromium.said.clear()
+
+
 def tapped(points, of="session_01/photo_0001.jpg", size=SIZE_PX) -> str:
     return f"corners?{urlencode({'of': of, 'numbers': ','.join(map(str, [*np.ravel(points), *size]))})}"
 
@@ -689,28 +702,27 @@ def test_a_design_without_markers_is_searched_for_first(tmp_path, sheet, bare, m
     assert found == [not markers]
 
 
-def test_a_finger_drags_the_corners_of_a_photograph(tmp_path, bare):
+def test_a_finger_drags_the_corners_of_a_photograph(tmp_path, bare, browser):
     sheet, photo = bare
     with gathered_in(tmp_path / "photos", sheet) as gathered, listening(gathered) as address:
-        with Browser(tmp_path) as browser:
-            browser.call("Page.navigate", url=address)
-            browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
-            assert browser.evaluate("document.querySelector('#corners').hidden")
-            browser.choose("#camera", photo)
-            browser.wait_for("document.querySelector('#tap img').naturalWidth == 480")
-            browser.evaluate("document.querySelector('#tap').scrollIntoView({block: 'center'})")
-            sides = browser.evaluate("(b => [b.left, b.top, b.width, b.height])(shown.getBoundingClientRect())")
-            corner, size = np.array(sides[:2]) + 9, np.array(sides[2:])  # touched beside the points
-            starts = corner + np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]) * size
-            for start, target in zip(starts, corner + CORNERS_PX / SIZE_PX * size, strict=True):
-                for kind, places in (("Start", [start]), ("Move", [start + 5]), ("Move", [target]), ("End", [])):
-                    touched = [{"x": x, "y": y} for x, y in places]
-                    browser.call("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=touched)
-                    assert browser.evaluate("document.querySelector('#loupe').hidden") == (kind == "End")
-            assert browser.evaluate("document.documentElement.scrollWidth") == 390
-            browser.evaluate("document.querySelector('#send').click()")
-            browser.wait_for("document.querySelector('#corners').hidden")
-            said = browser.evaluate("document.querySelector('#answer').innerText")
-            assert said.startswith("recognized as bright") and not browser.troubles
+        browser.call("Page.navigate", url=address)
+        browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
+        assert browser.evaluate("document.querySelector('#corners').hidden")
+        browser.choose("#camera", photo)
+        browser.wait_for("document.querySelector('#tap img').naturalWidth == 480")
+        browser.evaluate("document.querySelector('#tap').scrollIntoView({block: 'center'})")
+        sides = browser.evaluate("(b => [b.left, b.top, b.width, b.height])(shown.getBoundingClientRect())")
+        corner, size = np.array(sides[:2]) + 9, np.array(sides[2:])  # touched beside the points
+        starts = corner + np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]) * size
+        for start, target in zip(starts, corner + CORNERS_PX / SIZE_PX * size, strict=True):
+            for kind, places in (("Start", [start]), ("Move", [start + 5]), ("Move", [target]), ("End", [])):
+                touched = [{"x": x, "y": y} for x, y in places]
+                browser.call("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=touched)
+                assert browser.evaluate("document.querySelector('#loupe').hidden") == (kind == "End")
+        assert browser.evaluate("document.documentElement.scrollWidth") == 390
+        browser.evaluate("document.querySelector('#send').click()")
+        browser.wait_for("document.querySelector('#corners').hidden")
+        said = browser.evaluate("document.querySelector('#answer').innerText")
+        assert said.startswith("recognized as bright") and not browser.troubles
     numbers = load_corners(tmp_path / "photos" / "corners.csv")["session_01/photo_0001.jpg"].numbers
     assert numbers == pytest.approx(CORNERS_PX.ravel(), abs=2.0)

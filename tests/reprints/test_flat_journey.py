@@ -92,10 +92,11 @@ class Journey:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_views():
-    """A promise of 12 views and a selection of 4, since no rate is tested here."""
+    """A promise of 12 views, a selection of 4: no rate is tested here, nor how many photographs are advised."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 12)
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
+        patch.setattr("patchproof.evidence.verdict.kept_chance", lambda *_: 0.9)
         yield
 
 
