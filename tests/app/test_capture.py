@@ -30,6 +30,7 @@ pytest.importorskip("uvicorn")
 import uvicorn
 from browser import Browser
 from synthetic_photos import make_manifest, noisy_design, photograph, save
+from toy_studies import begin_with_timer
 
 from patchproof.app.capture import album as album_module
 from patchproof.app.capture import serve
@@ -39,7 +40,6 @@ from patchproof.app.capture.serve import server_config
 from patchproof.app.cli import journey
 from patchproof.app.verify import CaptureInfo, options_of
 from patchproof.app.verify import verify as verify_photos
-from patchproof.base import input
 from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
 from patchproof.evidence.annotations import load_corners
@@ -401,15 +401,9 @@ def test_the_map_of_views_by_hand():
     assert map_views([blind], shown, 12, None, 90.0) is None
 
 
-def has_timer(_: object) -> None:
-    """As the process apart begins: photographs are measured in a main thread, where their time is limited."""
-    assert input.has_timer()
-    serve.prepare_worker(None)
-
-
 def test_served_until_interrupted_and_begun_again(tmp_path, sheet, photos, monkeypatch):
     """With a process apart; what is in the folder is measured before there is an address."""
-    monkeypatch.setattr(serve, "prepare_worker", has_timer)
+    monkeypatch.setattr(serve, "prepare_worker", begin_with_timer)
     monkeypatch.setattr(serve, "options_of", lambda sheet, manifest, *_: options_of(sheet, manifest, [NET]))
     answers, measured = [], []
 
