@@ -379,9 +379,10 @@ def folder(tmp_path_factory):
     return photos
 
 
-def verified(folder, jobs=1, progress=lambda done, total: None, **options):
+def verified(folder, jobs=1, progress=lambda done, total: None, journal=None, resume=False, **options):
     options = Options([NET], identity_printer(), **{"ledger_photos": 0} | options)
-    return gather_evidence(folder, make_manifest(promise()), options, compute=Compute(jobs=jobs), advance=progress)
+    by = {"compute": Compute(jobs=jobs), "advance": progress, "journal": journal, "resume": resume}
+    return gather_evidence(folder, make_manifest(promise()), options, **by)
 
 
 def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
@@ -413,10 +414,9 @@ def test_photographs_that_show_nothing_never_count_whatever_the_network_answers(
     for name, picture in pictures.items():
         save(picture.astype(np.uint8), tmp_path / f"{name}.png")
 
-    def report():
-        return gather_evidence(
-            tmp_path, make_manifest(promise()), Options([always], identity_printer(), ledger_photos=0)
-        )
+    def report(**kept):
+        options, journal = Options([always], identity_printer(), ledger_photos=0), tmp_path / "out" / "photos.jsonl"
+        return gather_evidence(tmp_path, make_manifest(promise()), options, journal=journal, **kept)
 
     nothing = report()
     for photo in nothing.photos:
@@ -426,7 +426,7 @@ def test_photographs_that_show_nothing_never_count_whatever_the_network_answers(
     assert (summary.judged, summary.measured, summary.rate, summary.verdict) == (0, 0, None, "cannot_tell")
     assert [(s.recognized, s.judged) for s in summary.sessions] == [(0, 0)] * len(summary.sessions)
     (tmp_path / "b0.jpg").write_bytes((folder / "b0.jpg").read_bytes())  # beside one that shows the sheet
-    summary = report().summary
+    summary = report(resume=True).summary  # what they are is known
     assert (summary.judged, summary.models["net"].interval) == (1, wilson(1, 1))
     assert sum(s.recognized for s in summary.sessions) == 1 and summary.verdict == "cannot_tell"
 
@@ -463,7 +463,7 @@ def half_lit(code):
     return picture
 
 
-def test_controls_that_show_nothing_never_count_and_are_named(few, tmp_path):
+def test_controls_that_show_nothing_never_count_and_are_named(few, tmp_path, tmp_path_factory):
     """Lens caps, black frames and noise are no bare object: with them alone no effect is tested."""
     rng = np.random.default_rng(0)
     nothing = {
@@ -475,13 +475,14 @@ def test_controls_that_show_nothing_never_count_and_are_named(few, tmp_path):
     for name, picture in nothing.items():
         save(picture.astype(np.uint8), tmp_path / f"{name}.jpg")
     (tmp_path / "b9.jpg").write_bytes(b"no picture")
-    evidence = verified(few, controls=tmp_path)
+    journal = tmp_path_factory.mktemp("out") / "photos.jsonl"
+    evidence = verified(few, controls=tmp_path, journal=journal)
     (control,) = evidence.controls
     assert (control.n, control.shown, control.rates) == (0, None, None)
     said = evidence.summary.left_out
     assert sum("one tone or noise" in sentence for sentence in said) == 4 and any("b9.jpg" in each for each in said)
     save(half_lit(20), tmp_path / "b4.jpg")  # beside one of something
-    (control,) = verified(few, controls=tmp_path).controls
+    (control,) = verified(few, controls=tmp_path, journal=journal, resume=True).controls
     assert (control.recognized, control.n) == (0, 1)
 
 
