@@ -56,7 +56,7 @@ HOUR = (
     ("preview scene.toml", 0),
     ("optimize scene.toml --draft --out run", 0),
     ("sheet run --out sheet.pdf", 0),
-    ("reprint sheet.pdf --run run --n 12 --sessions 6 --out photos", 0),
+    ("reprint sheet.pdf --run run --n 8 --sessions 4 --out photos", 0),
     ("verify photos --sheet sheet.json --out report", 1),
     (f"verify photos --sheet sheet.json --out report --models {MODEL}", 0),
 )
@@ -153,7 +153,7 @@ def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     assert "next: patchproof sheet run --out sheet.pdf" in optimize and "sheet.json" in sheet
     assert f"or name the networks yourself (--models '{MODEL}')" in refused
     assert "Helps (controls rendered into these photographs)" in verify and "verdict: kept" in verify
-    assert "photographs: 15, judged 12, measured 10" in verify  # two are overexposed
+    assert "photographs: 11, judged 8, measured 7" in verify  # one is overexposed
     for named in (
         "copy: 2",
         "copy: 1 (session_03/Screenshot 2026-11-22.png): it shows what session_03/",

@@ -41,7 +41,8 @@ def blocks(language: str) -> list[str]:
 
 @pytest.fixture(autouse=True)
 def few_views(monkeypatch):
-    """Of a promise and of the selection set: what they cost is time."""
+    """Of a promise and of the selection set, and no chances of numbers to advise: what they cost is time."""
+    monkeypatch.setattr("patchproof.evidence.verdict.kept_chance", lambda *_: 0.9)
     monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 16)
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
 
@@ -50,9 +51,12 @@ def few_views(monkeypatch):
 def here(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
     toml = blocks("toml")[0]
-    # fewer steps and smaller photographs than a user would take
+    # fewer steps and smaller photographs than a user would take, before gray
     (folder / "scene.toml").write_text(
-        toml + "\n[optimize]\nsteps = 3\nviews = 2\n[camera]\nphoto_px = [800, 600]\n", encoding="utf-8"
+        toml
+        + "\n[optimize]\nsteps = 3\nviews = 2\n[camera]\nphoto_px = [800, 600]\n"
+        + "[background]\ncolor = [0.5, 0.5, 0.5]\n",
+        encoding="utf-8",
     )
     return folder
 
@@ -60,7 +64,7 @@ def here(tmp_path_factory):
 def test_commands(here, monkeypatch, capsys):
     monkeypatch.chdir(here)
     # fewer than a user would ask for
-    lines = re.sub(r"--n \d+ --sessions \d+", "--n 2 --sessions 2", blocks("console")[0]).replace("--n 100", "--n 4")
+    lines = re.sub(r"--n \d+ --sessions \d+", "--n 1 --sessions 1", blocks("console")[0]).replace("--n 100", "--n 4")
     for line in lines.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "patchproof"
@@ -101,7 +105,7 @@ def test_python(here, monkeypatch, capsys):
     (code,) = blocks("python")
     assert sum(bool(line.strip()) for line in code.splitlines()) <= 8
     monkeypatch.chdir(here)
-    fewer = code.replace('"truck")', '"truck", draft=True)').replace("48,", "4,").replace("sessions=12", "sessions=4")
+    fewer = code.replace('"truck")', '"truck", draft=True)').replace("48,", "2,").replace("sessions=12", "sessions=2")
     assert len(fewer) == len(code) + len(", draft=True") - 2
     monkeypatch.setattr("patchproof.optimizer.run.DRAFT_EFFORT", (1, 8))
     exec(compile(fewer, "README.md", "exec"), {})

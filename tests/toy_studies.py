@@ -104,3 +104,13 @@ def given_up(seconds):
         return limits.run_limited(spin, seconds)
     except PhotoRejected as cannot:
         return cannot.code
+
+
+def begin_with_timer(_):
+    """As a process apart for photographs begins: they are measured in a main thread, where their time is limited. Not
+    beside its test, which imports more than that process needs.
+    """
+    from patchproof.app.capture.collection import prepare_worker
+
+    assert bounds.has_timer()
+    prepare_worker(None)

@@ -30,6 +30,7 @@ pytest.importorskip("uvicorn")
 import uvicorn
 from browser import Browser
 from synthetic_photos import make_manifest, noisy_design, photograph, save
+from toy_studies import begin_with_timer
 
 from patchproof.app.capture import album as album_module
 from patchproof.app.capture import serve
@@ -39,7 +40,6 @@ from patchproof.app.capture.serve import server_config
 from patchproof.app.cli import journey
 from patchproof.app.verify import CaptureInfo, options_of
 from patchproof.app.verify import verify as verify_photos
-from patchproof.base import input
 from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
 from patchproof.evidence.annotations import load_corners
@@ -401,15 +401,9 @@ def test_the_map_of_views_by_hand():
     assert map_views([blind], shown, 12, None, 90.0) is None
 
 
-def has_timer(_: object) -> None:
-    """As the process apart begins: photographs are measured in a main thread, where their time is limited."""
-    assert input.has_timer()
-    serve.prepare_worker(None)
-
-
 def test_served_until_interrupted_and_begun_again(tmp_path, sheet, photos, monkeypatch):
     """With a process apart; what is in the folder is measured before there is an address."""
-    monkeypatch.setattr(serve, "prepare_worker", has_timer)
+    monkeypatch.setattr(serve, "prepare_worker", begin_with_timer)
     monkeypatch.setattr(serve, "options_of", lambda sheet, manifest, *_: options_of(sheet, manifest, [NET]))
     answers, measured = [], []
 
@@ -469,35 +463,34 @@ def test_the_command_line_has_it_without_the_libraries():
     assert done.returncode == 0 and "--lan" in done.stdout
 
 
-def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tmp_path, sheet, photos):
+def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tmp_path, sheet, photos, browser):
     taken = tmp_path / "IMG.jpg"
     taken.write_bytes(photos[2])
     dark = tmp_path / "dark.jpg"
     dark.write_bytes(photos[3])
     with gathered_in(tmp_path / "photos", sheet) as gathered, listening(gathered) as address:
-        with Browser(tmp_path) as browser:
-            browser.call("Page.navigate", url=address)
-            browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
-            browser.choose("#camera", taken)
-            said = browser.wait_for("document.querySelector('#answer').innerText")
-            assert said.startswith("recognized as bright") and "session_01/photo_0001.jpg" in said
-            assert browser.evaluate("document.querySelector('#answer img').naturalWidth") > 300
-            assert browser.evaluate("document.querySelector('#latest').innerText") == ""  # said once
-            browser.call(
-                "Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0
-            )
-            browser.choose("#camera", dark)
-            browser.wait_for("document.querySelector('#queue').innerText.includes('not sent yet')")
-            browser.call(
-                "Network.emulateNetworkConditions", offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1
-            )
-            assert browser.wait_for("document.querySelector('#answer b').innerText == 'not recognized'")
-            assert browser.evaluate("document.querySelector('#queue').childElementCount") == 0
-            assert browser.evaluate("document.documentElement.scrollWidth") == 390
-            assert {urlsplit(url).netloc for url in browser.requested if url.startswith("http")} == {
-                urlsplit(address).netloc
-            }
-            assert not [t for t in browser.troubles if "ERR_INTERNET_DISCONNECTED" not in json.dumps(t)]
+        browser.call("Page.navigate", url=address)
+        browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
+        browser.choose("#camera", taken)
+        said = browser.wait_for("document.querySelector('#answer').innerText")
+        assert said.startswith("recognized as bright") and "session_01/photo_0001.jpg" in said
+        assert browser.evaluate("document.querySelector('#answer img').naturalWidth") > 300
+        assert browser.evaluate("document.querySelector('#latest').innerText") == ""  # said once
+        browser.call(
+            "Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0
+        )
+        browser.choose("#camera", dark)
+        browser.wait_for("document.querySelector('#queue').innerText.includes('not sent yet')")
+        browser.call(
+            "Network.emulateNetworkConditions", offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1
+        )
+        assert browser.wait_for("document.querySelector('#answer b').innerText == 'not recognized'")
+        assert browser.evaluate("document.querySelector('#queue').childElementCount") == 0
+        assert browser.evaluate("document.documentElement.scrollWidth") == 390
+        assert {urlsplit(url).netloc for url in browser.requested if url.startswith("http")} == {
+            urlsplit(address).netloc
+        }
+        assert not [t for t in browser.troubles if "ERR_INTERNET_DISCONNECTED" not in json.dumps(t)]
     assert files_in(tmp_path / "photos")[1:] == ["session_01/photo_0001.jpg", "session_01/photo_0002.jpg"]
     assert set(CONTROLS) == {"bare", "mean", "gray", "noise", "blank"}
 
@@ -626,6 +619,20 @@ def bare(tmp_path_factory) -> tuple[Path, Path]:
     return folder / "sheet.json", save(photograph(page, PX_FROM_MM, SIZE_PX, noise=0.004, fine=2), folder / "a.jpg")
 
 
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory):
+    with Browser(tmp_path_factory.mktemp("browser")) as begun:
+        yield begun
+
+
+@pytest.fixture
+def browser(chromium):
+    """One for all pages, each of which it forgets: to begin takes it longer than a page does."""
+    yield chromium
+    chromium.call("Page.navigate", url="about:blank")  # which asks no server that has ended
+    chromium.said.clear()
+
+
 def tapped(points, of="session_01/photo_0001.jpg", size=SIZE_PX) -> str:
     return f"corners?{urlencode({'of': of, 'numbers': ','.join(map(str, [*np.ravel(points), *size]))})}"
 
@@ -689,28 +696,27 @@ def test_a_design_without_markers_is_searched_for_first(tmp_path, sheet, bare, m
     assert found == [not markers]
 
 
-def test_a_finger_drags_the_corners_of_a_photograph(tmp_path, bare):
+def test_a_finger_drags_the_corners_of_a_photograph(tmp_path, bare, browser):
     sheet, photo = bare
     with gathered_in(tmp_path / "photos", sheet) as gathered, listening(gathered) as address:
-        with Browser(tmp_path) as browser:
-            browser.call("Page.navigate", url=address)
-            browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
-            assert browser.evaluate("document.querySelector('#corners').hidden")
-            browser.choose("#camera", photo)
-            browser.wait_for("document.querySelector('#tap img').naturalWidth == 480")
-            browser.evaluate("document.querySelector('#tap').scrollIntoView({block: 'center'})")
-            sides = browser.evaluate("(b => [b.left, b.top, b.width, b.height])(shown.getBoundingClientRect())")
-            corner, size = np.array(sides[:2]) + 9, np.array(sides[2:])  # touched beside the points
-            starts = corner + np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]) * size
-            for start, target in zip(starts, corner + CORNERS_PX / SIZE_PX * size, strict=True):
-                for kind, places in (("Start", [start]), ("Move", [start + 5]), ("Move", [target]), ("End", [])):
-                    touched = [{"x": x, "y": y} for x, y in places]
-                    browser.call("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=touched)
-                    assert browser.evaluate("document.querySelector('#loupe').hidden") == (kind == "End")
-            assert browser.evaluate("document.documentElement.scrollWidth") == 390
-            browser.evaluate("document.querySelector('#send').click()")
-            browser.wait_for("document.querySelector('#corners').hidden")
-            said = browser.evaluate("document.querySelector('#answer').innerText")
-            assert said.startswith("recognized as bright") and not browser.troubles
+        browser.call("Page.navigate", url=address)
+        browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
+        assert browser.evaluate("document.querySelector('#corners').hidden")
+        browser.choose("#camera", photo)
+        browser.wait_for("document.querySelector('#tap img').naturalWidth == 480")
+        browser.evaluate("document.querySelector('#tap').scrollIntoView({block: 'center'})")
+        sides = browser.evaluate("(b => [b.left, b.top, b.width, b.height])(shown.getBoundingClientRect())")
+        corner, size = np.array(sides[:2]) + 9, np.array(sides[2:])  # touched beside the points
+        starts = corner + np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]) * size
+        for start, target in zip(starts, corner + CORNERS_PX / SIZE_PX * size, strict=True):
+            for kind, places in (("Start", [start]), ("Move", [start + 5]), ("Move", [target]), ("End", [])):
+                touched = [{"x": x, "y": y} for x, y in places]
+                browser.call("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=touched)
+                assert browser.evaluate("document.querySelector('#loupe').hidden") == (kind == "End")
+        assert browser.evaluate("document.documentElement.scrollWidth") == 390
+        browser.evaluate("document.querySelector('#send').click()")
+        browser.wait_for("document.querySelector('#corners').hidden")
+        said = browser.evaluate("document.querySelector('#answer').innerText")
+        assert said.startswith("recognized as bright") and not browser.troubles
     numbers = load_corners(tmp_path / "photos" / "corners.csv")["session_01/photo_0001.jpg"].numbers
     assert numbers == pytest.approx(CORNERS_PX.ravel(), abs=2.0)

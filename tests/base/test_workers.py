@@ -6,6 +6,7 @@ import os
 import pickle
 import re
 import signal
+import sys
 import time
 from concurrent.futures import Future
 
@@ -209,10 +210,27 @@ def test_jobs_and_a_cluster_exclude_each_other():
         pass
 
 
+@pytest.fixture
+def quick_start():
+    """Processes of a cluster, three with the one that takes a dead one's place, are forked off one that has imported
+    what they need: each on its own would import it for 2 s.
+    """
+    dask = pytest.importorskip("dask", reason="needs dask: pip install 'patchproof[cluster]'")
+    utils = pytest.importorskip("distributed.utils", reason="needs dask: pip install 'patchproof[cluster]'")
+    if sys.platform != "linux":
+        yield
+        return
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        utils.get_mp_context().set_forkserver_preload(["distributed", "torch", "patchlab.study.study"])
+        yield
+
+
 @pytest.mark.filterwarnings("ignore")  # distributed's own, at the end of its processes
-def test_a_cluster_gives_the_same_also_when_workers_die(tmp_path):
+def test_a_cluster_gives_the_same_also_when_workers_die(tmp_path, monkeypatch, quick_start):
     """Of single items, and to the byte of a whole study, in whose midst a worker dies."""
-    distributed = pytest.importorskip("distributed", reason="needs dask: pip install 'patchproof[cluster]'")
+    import distributed
+
+    monkeypatch.setattr("patchproof.report.tables.draw_figure", lambda *_, **__: b"drawn here, not by workers")
     settings = toy.ToySettings(numbers=tuple(range(8)), die_in=str(tmp_path))
     run_cells(toy.STUDY, settings, tmp_path, tmp_path / "here")
     (tmp_path / "n3").touch()

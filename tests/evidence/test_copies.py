@@ -102,7 +102,7 @@ def test_copies_of_one_photograph_prove_nothing_and_are_named(tmp_path):
     photos = tmp_path / "photos"
     photos.mkdir()
     save(shot(), photos / "a.jpg")
-    for i in range(10):
+    for i in range(5):
         shutil.copy(photos / "a.jpg", photos / f"b{i}.jpg")
     Image.open(photos / "a.jpg").save(photos / "c.jpg", quality=70)  # saved anew
     Image.open(photos / "a.jpg").resize((720, 540)).point(lambda code: 1.1 * code).save(photos / "i.jpg", quality=90)
@@ -121,15 +121,15 @@ def test_copies_of_one_photograph_prove_nothing_and_are_named(tmp_path):
         save(np.tile(np.linspace(0, 255, 100).astype(np.uint8)[:, None], (100, 1, 3)), controls / name)
     report = verified(photos, controls=controls)
     codes = {photo.file: photo.code for photo in report.photos}
-    assert codes["a.jpg"] is None and {codes[f"b{i}.jpg"] for i in range(10)} == {codes["c.jpg"]} == {"copy"}
+    assert codes["a.jpg"] is None and {codes[f"b{i}.jpg"] for i in range(5)} == {codes["c.jpg"]} == {"copy"}
     assert codes["d.jpg"] == codes["h.jpg"] == codes["i.jpg"] == "copy"
     assert codes["Screenshot_1.jpg"] == "cropped"
     summary = report.summary
-    assert (summary.photos, summary.judged, summary.verdict) == (16, 2, "cannot_tell")
+    assert (summary.photos, summary.judged, summary.verdict) == (11, 2, "cannot_tell")
     assert report.controls[0].n == 1
     lines = "\n".join(verdict_lines(report))
     for words in (
-        "copy: 10 (b0.jpg, b1.jpg, b2.jpg and 7 more): its bytes are those of a.jpg",
+        "copy: 5 (b0.jpg, b1.jpg, b2.jpg and 2 more): its bytes are those of a.jpg",
         "copy: 4 (c.jpg, d.jpg, h.jpg and 1 more): it shows what a.jpg shows",
         "cropped: 1 (Screenshot_1.jpg): it is a crop or a screenshot",
         "take still photographs): e.mp4",
@@ -140,7 +140,7 @@ def test_copies_of_one_photograph_prove_nothing_and_are_named(tmp_path):
         assert words in lines
     assert "a.mov" not in lines
     table = photos_csv(report.model_dump(mode="json")["photos"])
-    assert table.count(",copy,") == 14 and '"its bytes are those of a.jpg' in table
+    assert table.count(",copy,") == 9 and '"its bytes are those of a.jpg' in table
 
 
 @pytest.mark.parametrize(

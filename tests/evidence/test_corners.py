@@ -286,9 +286,12 @@ def test_corners_outside_of_the_picture_are_said(printed):
 
 
 def test_corners_are_the_file_s_pixels_at_half_its_size_and_a_refusal_keeps_the_report(printed, monkeypatch):
-    folder, whole = printed[0], judged(printed[0], printed[0] / "photos" / "corners.csv", "whole").photos[0]
+    folder = printed[0]
+    head, first, *_ = (folder / "photos" / "corners.csv").read_text().splitlines()
+    (folder / "first.csv").write_text(f"{head}\n{first}")  # the others are not looked at
+    whole = judged(folder, folder / "first.csv", "whole").photos[0]
     monkeypatch.setattr(read, "WHOLE_PX", 480 * 360 - 1)
-    half = judged(folder, folder / "photos" / "corners.csv", "half").photos[0]
+    half = judged(folder, folder / "first.csv", "half").photos[0]
     assert (half.status, half.photo_px) == ("measured", (240, 180)) and whole.photo_px == (480, 360)
     whole_px, half_px = (
         apply_homography(np.array(photo.geometry.homography_px_from_mm), np.array([(80.0, 80.0)]))

@@ -243,8 +243,10 @@ NET = Classifier("net", None, 240, ("striped", "plain"), stripes)
 def raster(faded: bool, two_colors: bool = False) -> np.ndarray:
     page = page_raster(sheet(two_colors), True)
     if faded:  # paper white and marker black stay as they are
-        page = 0.45 * page + 0.55 * page.mean(-1, keepdims=True)
-    return page.astype(np.float32)
+        gray = page @ np.full(3, 0.55 / 3, np.float32)
+        page *= np.float32(0.45)
+        page += gray[..., None]
+    return page
 
 
 def take(folder, faded=False, light=0.75, **look):

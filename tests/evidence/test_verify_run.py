@@ -363,10 +363,13 @@ def test_a_scan_at_another_resolution_than_stated_has_no_scale_and_says_so(dpi, 
     assert f"cannot be a scan at {dpi} dpi" in look.entry.remark.advice and "no scale" in look.entry.remark.advice
 
 
+PHOTOS = 6  # of the piece, in the folder: fewer pairs than six show no effect
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     photos = tmp_path_factory.mktemp("photos")
-    for i in range(6):
+    for i in range(PHOTOS):
         save(shot(8 * i - 20, 500 + 20 * i, seed=i, noise=0.003), photos / f"b{i}.jpg")
     (photos / "a.JPG").write_text("no picture")
     save(np.full((200, 300, 3), 99, np.uint8), photos / "c.png")
@@ -376,21 +379,22 @@ def folder(tmp_path_factory):
     return photos
 
 
-def verified(folder, jobs=1, progress=lambda done, total: None, **options):
+def verified(folder, jobs=1, progress=lambda done, total: None, journal=None, resume=False, **options):
     options = Options([NET], identity_printer(), **{"ledger_photos": 0} | options)
-    return gather_evidence(folder, make_manifest(promise()), options, compute=Compute(jobs=jobs), advance=progress)
+    by = {"compute": Compute(jobs=jobs), "advance": progress, "journal": journal, "resume": resume}
+    return gather_evidence(folder, make_manifest(promise()), options, **by)
 
 
 def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
     calls = []
     report = verified(folder, progress=lambda done, total: calls.append((done, total)), ledger_photos=2)
-    assert [p.file for p in report.photos] == ["a.JPG", *(f"b{i}.jpg" for i in range(6)), "c.png"]
-    assert [p.code for p in report.photos] == ["unreadable", *[None] * 6, "too_few_markers"]
+    assert [p.file for p in report.photos] == ["a.JPG", *(f"b{i}.jpg" for i in range(PHOTOS)), "c.png"]
+    assert [p.code for p in report.photos] == ["unreadable", *[None] * PHOTOS, "too_few_markers"]
     summary = report.summary
-    assert (summary.photos, summary.judged, summary.measured, summary.rate) == (8, 6, 6, 1.0)
+    assert (summary.photos, summary.judged, summary.measured, summary.rate) == (PHOTOS + 2, PHOTOS, PHOTOS, 1.0)
     # one of seven readable photographs shows no marker: more than 10 %
     assert (summary.verdict, summary.worth.word, summary.ledger) == ("cannot_tell", "cannot_tell", None)
-    assert calls[-1] == (8, 8)
+    assert calls[-1] == (PHOTOS + 2,) * 2
     prediction = report.photos[1].predictions["net"]
     assert prediction.label == "bright" and prediction.recognized
     assert prediction.confidence == prediction.target_confidence > 0.5
@@ -410,10 +414,9 @@ def test_photographs_that_show_nothing_never_count_whatever_the_network_answers(
     for name, picture in pictures.items():
         save(picture.astype(np.uint8), tmp_path / f"{name}.png")
 
-    def report():
-        return gather_evidence(
-            tmp_path, make_manifest(promise()), Options([always], identity_printer(), ledger_photos=0)
-        )
+    def report(**kept):
+        options, journal = Options([always], identity_printer(), ledger_photos=0), tmp_path / "out" / "photos.jsonl"
+        return gather_evidence(tmp_path, make_manifest(promise()), options, journal=journal, **kept)
 
     nothing = report()
     for photo in nothing.photos:
@@ -423,31 +426,33 @@ def test_photographs_that_show_nothing_never_count_whatever_the_network_answers(
     assert (summary.judged, summary.measured, summary.rate, summary.verdict) == (0, 0, None, "cannot_tell")
     assert [(s.recognized, s.judged) for s in summary.sessions] == [(0, 0)] * len(summary.sessions)
     (tmp_path / "b0.jpg").write_bytes((folder / "b0.jpg").read_bytes())  # beside one that shows the sheet
-    summary = report().summary
+    summary = report(resume=True).summary  # what they are is known
     assert (summary.judged, summary.models["net"].interval) == (1, wilson(1, 1))
     assert sum(s.recognized for s in summary.sessions) == 1 and summary.verdict == "cannot_tell"
 
 
 @pytest.fixture(scope="module")
 def few(folder, tmp_path_factory):
-    """Two of the folder's photographs, and what is none."""
+    """One of the folder's photographs, and what is none."""
     photos = tmp_path_factory.mktemp("few")
-    for name in ("a.JPG", "b0.jpg", "b4.jpg"):
+    for name in ("a.JPG", "b0.jpg"):
         (photos / name).write_bytes((folder / name).read_bytes())
     return photos
 
 
-def test_two_processes_give_the_same_bytes_as_one(few):
-    assert verified(few, jobs=2).model_dump_json() == verified(few).model_dump_json()
+def test_two_processes_give_the_same_bytes_as_one(few, folder, tmp_path):
+    for photo in (*few.iterdir(), folder / "b3.jpg"):
+        (tmp_path / photo.name).write_bytes(photo.read_bytes())
+    assert verified(tmp_path, jobs=2).model_dump_json() == verified(tmp_path).model_dump_json()
 
 
 def test_controls_of_one_session_are_paired_and_cannot_decide_the_effect(folder, tmp_path):
-    for i in range(6):
+    for i in range(PHOTOS):
         save(half_lit(20 + i), tmp_path / f"b{i}.jpg")
     evidence = verified(folder, controls=tmp_path)
     assert evidence.summary.worth.word != "helps" and not evidence.summary.meets("helps")
     (control,) = evidence.controls
-    assert (control.recognized, control.n, control.pairs, control.sessions) == (0, 6, 6, 1)
+    assert (control.recognized, control.n, control.pairs, control.sessions) == (0, PHOTOS, PHOTOS, 1)
     assert "two places" in control.advice and "This cannot tell" in "".join(verdict_lines(evidence))
 
 
@@ -458,7 +463,7 @@ def half_lit(code):
     return picture
 
 
-def test_controls_that_show_nothing_never_count_and_are_named(few, tmp_path):
+def test_controls_that_show_nothing_never_count_and_are_named(few, tmp_path, tmp_path_factory):
     """Lens caps, black frames and noise are no bare object: with them alone no effect is tested."""
     rng = np.random.default_rng(0)
     nothing = {
@@ -470,13 +475,14 @@ def test_controls_that_show_nothing_never_count_and_are_named(few, tmp_path):
     for name, picture in nothing.items():
         save(picture.astype(np.uint8), tmp_path / f"{name}.jpg")
     (tmp_path / "b9.jpg").write_bytes(b"no picture")
-    evidence = verified(few, controls=tmp_path)
+    journal = tmp_path_factory.mktemp("out") / "photos.jsonl"
+    evidence = verified(few, controls=tmp_path, journal=journal)
     (control,) = evidence.controls
     assert (control.n, control.shown, control.rates) == (0, None, None)
     said = evidence.summary.left_out
     assert sum("one tone or noise" in sentence for sentence in said) == 4 and any("b9.jpg" in each for each in said)
     save(half_lit(20), tmp_path / "b4.jpg")  # beside one of something
-    (control,) = verified(few, controls=tmp_path).controls
+    (control,) = verified(few, controls=tmp_path, journal=journal, resume=True).controls
     assert (control.recognized, control.n) == (0, 1)
 
 
@@ -515,7 +521,7 @@ def test_workers_get_whole_paths(few, tmp_path, monkeypatch):
         gather, "measure_all", lambda task, items, *rest: given.extend(items) or measure_all(task, items, *rest)
     )
     verified(Path(few.name), controls=Path(os.path.relpath(tmp_path)))
-    assert len(given) == 4 and all(item.path.is_absolute() for item in given)
+    assert len(given) == 3 and all(item.path.is_absolute() for item in given)
 
 
 def test_without_its_workers_no_journal_is_begun(few, tmp_path, monkeypatch):

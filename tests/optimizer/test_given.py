@@ -286,7 +286,8 @@ def test_several_designs_are_compared_on_the_same_conditions(several, capsys):
     assert command("evaluate", runs[0], "--out", out) == 2
 
 
-def test_runs_of_one_scene_in_two_folders_are_compared_unless_their_networks_are_other_files(tmp_path):
+def test_runs_of_one_scene_in_two_folders_are_compared_unless_their_networks_are_other_files(tmp_path, monkeypatch):
+    monkeypatch.setattr("patchproof.report.tables.draw_figure", lambda *_, **__: b"drawn above")
     for folder in "ab":
         import_patch(slopes(64, 64), scene_with(tmp_path / folder, **SMALL), tmp_path / folder / "run", **DRAFT)
     assert compare_runs([tmp_path / folder / "run" for folder in "ab"], tmp_path / "out", n=4, trust=True).tables

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from matplotlib.figure import Figure
 from PIL import Image
 
 from patchproof.base.errors import Refused
@@ -382,7 +383,7 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_se
     of the five poses a process keeps.
     """
     monkeypatch.setattr(expectation, "MIN_POSES", 5)
-    monkeypatch.setattr(place_files, "_SIDE_PX", 64)  # the picture of the places is not compared
+    monkeypatch.setattr(place_files, "_draw", lambda *_: Figure())  # the picture of the places is not compared
     scene = toml(tmp_path / "scene.toml", optimize__steps=2, optimize__views=5, patch__place="auto")
     files = ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
     with use_threads(1):
