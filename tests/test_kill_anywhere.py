@@ -100,7 +100,7 @@ def prepare(base: Path) -> None:
     shutil.copy(base / "page" / "sheet.pdf", base)
     (base / "sheet.json").write_text(json.dumps(manifests()[0]))
     (base / "photos").mkdir()
-    for name in "ab":
+    for name in "abc":
         (base / "photos" / f"{name}.jpg").write_bytes(honest_photo())
 
 
