@@ -46,6 +46,8 @@ class Watch:
             return bool(writes) and not isinstance(path, int) and not self.inside(path)
         if self.WRITES.match(event):
             return not self.inside(arguments[0])
+        if event == "ctypes.dlopen" and sys.platform == "linux":  # threadpoolctl looks at libraries that are there
+            return str(arguments[0]) not in Path("/proc/self/maps").read_text(encoding="utf-8")
         return bool(self.NEVER.match(event))
 
     def inside(self, path) -> bool:
