@@ -58,7 +58,7 @@ def piece():
 @functools.cache
 def rolled_photograph():
     """Of the piece at a radius of 150 mm."""
-    return curled_photograph(piece(), pose(), MATRIX, 1 / 150, fine=2)
+    return curled_photograph(piece(), pose(), MATRIX, 1 / 150)
 
 
 def unrolled(corners_px, focal_px=None):
@@ -148,6 +148,6 @@ def test_an_uncut_page_is_not_counted_when_it_curls_either(monkeypatch):
     """
     whole = page_raster(make_manifest(), only_piece=False)
     monkeypatch.setattr(synthetic_photos, "CUT_MM", (0.0, 0.0, *synthetic_photos.PAGE_MM))
-    photo = curled_photograph(whole, pose(), MATRIX, 1 / 150, fine=2)
+    photo = curled_photograph(whole, pose(), MATRIX, 1 / 150)
     monkeypatch.undo()
     assert not measured(photo).counted
