@@ -159,9 +159,8 @@ def _explain(model: type[BaseModel], errors: Sequence[ErrorDetails], data: Any, 
     error, place = errors[0], _location(errors[0], data)
     key, last = ".".join(map(str, place)), place[-1] if place else ""
     if error["type"] == "extra_forbidden":
-        return Refused(
-            f"only known keys in {source}", f'"{key}"', spelling_hint(str(last), _keys_at(model, place[:-1]))
-        )
+        hint = spelling_hint(str(last), _keys_at(model, place[:-1]))
+        return Refused(f"only known keys in {source}", f'"{key}"', hint)
     if error["type"] != "missing":
         reasons = dict.fromkeys(_reason(each) for each in errors if _location(each, data) == place)
         reason = " or ".join(reasons).replace(" or input should be", " or")
@@ -192,12 +191,12 @@ def _location(error: ErrorDetails, data: Any) -> tuple[int | str, ...]:
     """Where an error is, without the kinds of value that were tried there: ("label", "str") is ("label",)."""
     known: list[Any] = []
     for number, part in enumerate(error["loc"], 1):
-        values: Any = (
-            data if isinstance(data, dict) else dict(enumerate(data if isinstance(data, list | tuple) else ()))
-        )
-        if part in values or (error["type"] == "missing" and number == len(error["loc"])):
+        is_index = isinstance(data, list | tuple) and isinstance(part, int) and part < len(data)
+        if (is_known := is_index or (isinstance(data, dict) and part in data)) or (
+            error["type"] == "missing" and number == len(error["loc"])
+        ):
             known.append(part)
-            data = values.get(part)
+            data = data[part] if is_known else None
     return (*known,)
 
 
