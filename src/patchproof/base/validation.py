@@ -189,11 +189,11 @@ def _reason(error: ErrorDetails) -> str:
 
 def _location(error: ErrorDetails, data: Any) -> tuple[int | str, ...]:
     """Where an error is, without the kinds of value that were tried there: ("label", "str") is ("label",)."""
-    known: list[Any] = []
-    for number, part in enumerate(error["loc"], 1):
+    known, location = list[Any](), list[Any](error["loc"])
+    for number, part in enumerate(location, 1):
         is_index = isinstance(data, list | tuple) and isinstance(part, int) and part < len(data)
         if (is_known := is_index or (isinstance(data, dict) and part in data)) or (
-            error["type"] == "missing" and number == len(error["loc"])
+            error["type"] == "missing" and number == len(location)
         ):
             known.append(part)
             data = data[part] if is_known else None
