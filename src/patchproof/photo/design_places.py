@@ -1,10 +1,10 @@
 """Propose places of a design in a photograph that has no markers.
 
-In: a photograph's pixels, a design's, its size on the page. Out: corners 4×2 px in the photograph's copy of
-`SEARCHED_PX`, rough and often wrong. Two sources: SIFT features of the design at several sizes, whose matches vote for
-a place, size and angle (single matches of blocks are often wrong); and the correlation of a small design with the
-photograph over sizes, angles and slants, which finds smooth designs, too. Left out on purpose: prints smaller than
-`SMALLEST_PRINT_PX` there, and smooth prints turned by more than 50 degrees, whose templates would double the time.
+In: a photograph's pixels, a design's, its size on the page. Out: corners 4×2 px, rough and often wrong. Two sources:
+SIFT features of the design at several sizes, whose matches vote for a place, size and angle (single matches of blocks
+are often wrong); and the correlation of a small design with the photograph over sizes, angles and slants, which finds
+smooth designs, too. Left out on purpose: prints smaller than `SMALLEST_PRINT_PX` in a copy of `SEARCHED_PX`, and smooth
+prints turned by more than 50 degrees, whose templates would double the time.
 
 Source: Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004 (features, votes); Barath et al.,
 MAGSAC++, CVPR 2020.
@@ -18,17 +18,18 @@ import numpy as np
 from scipy import fft
 
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.base.resample import downscale, downscaled_size, halving_pyramid
+from patchproof.base.resample import downscaled_size, halving_pyramid
 from patchproof.photo.detect import is_plausible_quad
 from patchproof.sheets.manifest import Rect
 
-SEARCHED_PX = 1600  # longer side of the picture in which places are proposed
+SEARCHED_PX = 1600  # longer side of the copy of a large photograph in which prints have their least size
 SMALLEST_PRINT_PX = 60.0  # of the design's shorter side there
-# Longer side of the copy that features are taken from: of 180 prints 66 to 160 px wide 164 are found, as at 1600.
-_FEATURES_PX = 1280
+# Longer side of the copy that features are taken from, and their number: of 90 prints 66 to 160 px wide in 1600 px 85
+# are found, by 1280 and 6000 in 1.3 times the seconds 84, by 900 and 3000 83.
+_FEATURES_PX, _MOST_FEATURES = 1024, 4000
 _FEATURE_SIZES_PX = (64, 128, 256, 512)  # of the drawn design's longer side
 _NEIGHBORS = 3  # photograph's features that may be a feature of the design
-_MOST_MATCHES = 2000
+_MOST_MATCHES = 1000
 _VOTE_SHARE, _VOTE_LOG_SIZE, _VOTE_RAD = 0.25, 0.4, 0.5  # matches that agree: of the print's side, size, angle
 _LEAST_VOTES = 4
 _MOST_PLACES = 8  # of each source
@@ -42,14 +43,21 @@ class SearchedPhoto:
     """Copies of a photograph, itself the first, and its features: read once for all designs that are looked for."""
 
     def __init__(self, srgb: np.ndarray):
-        self.levels, self.small = halving_pyramid(srgb), downscale(srgb, SEARCHED_PX)
+        self.levels = halving_pyramid(srgb)
+        self.zoom = max(1.0, max(srgb.shape[:2]) / SEARCHED_PX)  # of its pixels in one of the copy of `SEARCHED_PX`
+
+    def copy_of(self, longest_px: float) -> np.ndarray:
+        """The photograph at a longer side of `longest_px` at most, by area from the next larger level."""
+        size = downscaled_size(self.levels[0].shape[1::-1], longest_px)
+        larger = [level for level in self.levels if min(np.array(level.shape[1::-1]) - size) >= 0]
+        return cv2.resize(larger[-1], size, interpolation=cv2.INTER_AREA)
 
     @cached_property
     def features(self) -> tuple[np.ndarray, np.ndarray]:
-        """In pixels of the copy of `SEARCHED_PX`."""
-        smaller = downscale(self.small, _FEATURES_PX)
-        found, descriptors = _features(cv2.cvtColor(smaller, cv2.COLOR_RGB2GRAY))
-        zoom = max(self.small.shape[:2]) / max(smaller.shape[:2])
+        """Features of the photograph, in its pixels, and their descriptors."""
+        copy = self.copy_of(_FEATURES_PX)
+        found, descriptors = _features(cv2.cvtColor(copy, cv2.COLOR_RGB2GRAY))
+        zoom = max(self.levels[0].shape[:2]) / max(copy.shape[:2])
         return found * (zoom, zoom, zoom, 1), descriptors
 
 
@@ -63,7 +71,7 @@ def draw_design(design: np.ndarray, size_mm: tuple[float, float], longer_px: flo
 
 def _features(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """SIFT features N×4 (x, y with centers at .5, diameter, angle in radians) and descriptors N×128 (root of L1)."""
-    points, descriptors = cv2.SIFT.create(nfeatures=6000, contrastThreshold=0.02).detectAndCompute(gray, None)
+    points, descriptors = cv2.SIFT.create(nfeatures=_MOST_FEATURES, contrastThreshold=0.02).detectAndCompute(gray, None)
     if descriptors is None:
         return np.zeros((0, 4)), np.zeros((0, 128), np.float32)
     table = [(p.pt[0] + 0.5, p.pt[1] + 0.5, p.size, np.radians(p.angle)) for p in points]
@@ -114,7 +122,7 @@ def places_by_features(photo: SearchedPhoto, design: np.ndarray, size_mm: tuple[
         agree[:, members] = False
         agree[members] = False
         middle_size = np.exp(np.median(size[members]))
-        pairs, most_px = (source[members], target[members]), float(max(2.0, 0.02 * middle_size))
+        pairs, most_px = (source[members], target[members]), float(max(2.0 * photo.zoom, 0.02 * middle_size))
         homography, _ = cv2.findHomography(*pairs, cv2.USAC_MAGSAC, most_px, maxIters=2000)
         corners = rect_corners((0, 0, *shape))
         quad = None if homography is None else apply_homography(homography, corners)
@@ -141,14 +149,12 @@ def _nearest(own: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def places_by_templates(photo: SearchedPhoto, design: np.ndarray, size_mm: tuple[float, float]) -> list[np.ndarray]:
     """Corners 4×2 px where a small design correlates best with the picture, over sizes, angles and slants."""
     found: list[tuple[float, np.ndarray]] = []
-    most_px, last = max(photo.small.shape[:2]), len(photo.levels) - 1
-    longer_px = SMALLEST_PRINT_PX * 0.8 * max(size_mm) / min(size_mm)
+    most_px = max(photo.levels[0].shape[:2])
+    longer_px = photo.zoom * SMALLEST_PRINT_PX * 0.8 * max(size_mm) / min(size_mm)
     drawn = draw_design(design, size_mm, 4 * _TEMPLATE_PX)
     while longer_px < 0.95 * most_px:
         scale = _TEMPLATE_PX / longer_px
-        size = downscaled_size(photo.small.shape[1::-1], most_px * scale)
-        halvings = np.log2(max(photo.levels[0].shape[:2]) / max(size)) - 1  # of at least twice the size
-        small = cv2.resize(photo.levels[int(np.clip(halvings, 0, last))], size, interpolation=cv2.INTER_AREA)
+        small = photo.copy_of(most_px * scale)
         middle = np.array(small.shape[1::-1]) / 2
         templates = list(_templates(drawn, small.shape[:2]))
         for turn in _TURNS_DEG:

@@ -11,7 +11,7 @@ Source: Baker and Matthews, Lucas-Kanade 20 Years On, IJCV 2004 (inverse composi
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache, partial
 from operator import itemgetter
 
 import cv2
@@ -21,7 +21,6 @@ from patchproof.base.geometry import apply_homography, fit_homography
 from patchproof.base.resample import index_homography
 from patchproof.photo import detect
 from patchproof.photo.design_places import (
-    SEARCHED_PX,
     SMALLEST_PRINT_PX,
     SearchedPhoto,
     draw_design,
@@ -101,10 +100,9 @@ def find_design(srgb: np.ndarray, design: np.ndarray, size_mm: tuple[float, floa
         raise PhotoRejected("no_corners", place.likeness, LEAST_LIKENESS, _UNDIRECTED_ADVICE)
     turned = place.significance > found[0].significance + _TURNED_BY
     place = (turned and refiners[0].refine(place.corners_px)) or found[0]
-    side_px = min(1.0, SEARCHED_PX / max(srgb.shape[:2])) * detect.side_px(place.corners_px)
-    side_px *= float(np.sqrt(min(size_mm) / max(size_mm)))
+    side_px = detect.side_px(place.corners_px) * np.sqrt(min(size_mm) / max(size_mm)) / refiners[0].photo.zoom
     if side_px < SMALLEST_PRINT_PX:
-        raise PhotoRejected("too_small", side_px, SMALLEST_PRINT_PX, _SMALL_ADVICE)
+        raise PhotoRejected("too_small", float(side_px), SMALLEST_PRINT_PX, _SMALL_ADVICE)
     return DesignCorners(place.corners_px, place.sigma_px, "found")
 
 
@@ -143,12 +141,10 @@ def _best_turn(refiners: list["_Refiner"], corners_px: np.ndarray) -> tuple[Foun
 
 def _find_places(refiner: "_Refiner", by_templates: bool = True) -> list[FoundPlace]:
     """Places of a design in a photograph that do not overlap, the most significant first, accepted or not."""
-    photo, sought = refiner.photo, (refiner.design, refiner.size_mm)
-    scale = np.array(photo.levels[0].shape[1::-1]) / photo.small.shape[1::-1]
-    places = _distinct(map(refiner.refine, (quad * scale for quad in places_by_features(photo, *sought))))
+    sought = refiner.photo, refiner.design, refiner.size_mm
+    places = _distinct(map(refiner.refine, places_by_features(*sought)))
     if by_templates and not (places and places[0].accepted):
-        by_template = (quad * scale for quad in places_by_templates(photo, *sought))
-        places = _distinct([*places, *map(refiner.refine, by_template)])
+        places = _distinct([*places, *map(refiner.refine, places_by_templates(*sought))])
     return places
 
 
@@ -165,7 +161,7 @@ class _Refiner:
 
     def __init__(self, photo: SearchedPhoto, design: np.ndarray, size_mm: tuple[float, float]):
         self.photo, self.design, self.size_mm = photo, design, size_mm
-        self.template = cache(lambda px, surroundings: _SmallDesign(draw_design(design, size_mm, px), surroundings))
+        self.template = partial(_small_design, design.tobytes(), design.shape, size_mm)
 
     def refine(self, quad: np.ndarray, closely: bool = True) -> FoundPlace | None:
         """The refined place, or None if it is none that a camera can see. To compare directions it need not be done
@@ -279,6 +275,14 @@ class _SmallDesign:
         likeness, corners = best
         variance = max(1 - likeness**2, 0.0) * self.colors.shape[1] / max(self.freedom, 1.0)
         return corners, likeness, _corner_sigma(px_from_unit, np.linalg.inv(hessian) * variance)
+
+
+@lru_cache(maxsize=32)  # the design and its mirror image at the sizes that one photograph after the other asks for
+def _small_design(
+    pixels: bytes, shape: tuple[int, ...], size_mm: tuple[float, float], longer_px: float, surroundings: float
+) -> _SmallDesign:
+    design = np.frombuffer(pixels, np.uint8).reshape(shape)
+    return _SmallDesign(draw_design(design, size_mm, longer_px), surroundings)
 
 
 def _mixture(colors: np.ndarray, seen: np.ndarray) -> np.ndarray:
