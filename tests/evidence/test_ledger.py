@@ -152,7 +152,7 @@ def test_a_print_of_small_blocks_is_read_through_each_photographs_own_veil_tone_
     """70 × 70 blocks, whose 16 × 16 means are alike. ΔE00 of cells as one photograph shows them, halved."""
     sent = np.random.default_rng(0).random((70, 70, 3)).repeat(2, 0).repeat(2, 1)
     promised, ink = shown_by("coated", sent).astype(np.float32), shown_by("coated", INK)[0, 0]
-    terms = [np.array([v, v, v, *np.log(paper) * np.ones(3), t, c]) for v, paper, t, c in LOOKS]
+    terms = [np.array([v, v, v, *np.log(paper) * np.ones(3), t, t, t, c]) for v, paper, t, c in LOOKS]
     looks = [ShownColors.of_terms(t) for t in terms]
     light, end = (cell_means(np.moveaxis(x, -1, 0), (70, 70), 0.0) for x in (shown_by("uncoated", sent), promised))
     seen_ink = shown_by("uncoated", INK)[0, 0]

@@ -92,9 +92,9 @@ class Journey:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_views():
-    """A promise of 12 views, a selection of 4: no rate is tested here, nor how many photographs are advised."""
+    """A promise of 18 views, which show each of six photographs; no rate is tested here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 12)
+        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 18)
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
         patch.setattr("patchproof.evidence.verdict.kept_chance", lambda *_: 0.9)
         yield
@@ -160,7 +160,7 @@ def as_taken(scene, n: int):
     background[:, 0], background[:, 1] = (np.arange(n) + 0.5) / n, np.log(1 / low) / np.log(high / low)
     still = {"background": background, "roll_deg": none, "look_at_offset": np.zeros((n, 3)), "jpeg": none + 95}
     camera = {"exposure_ev": none, "white_balance": one, "blur_px": none, "noise": none}
-    return with_values(drawn, **still, **camera, dot_gain=none, density=none, chroma=none, veil=0 * one, tone=none)
+    return with_values(drawn, **still, **camera, dot_gain=none, density=none, chroma=none, veil=0 * one, tone=0)
 
 
 def design_pixels(homography, scene, size_px) -> np.ndarray:

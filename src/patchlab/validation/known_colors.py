@@ -24,9 +24,10 @@ from torch.nn.functional import pad
 from patchproof.base.color import ciede2000, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
 from patchproof.base.settings import CameraSettings, PrinterSettings
 from patchproof.calibrate.chart import printer_of
+from patchproof.channel.effects import tone_by_channel
 from patchproof.channel.printer import Printer, printer_output, vary_print
 
-_CENTER = (-0.075, 0.025, 0.025, 0.025, 0.0, 0.0, 0.0, 0.0)  # of the terms in the default conditions
+_CENTER = (-0.075, 0.025, 0.025, 0.025, *[0.0] * 6)  # of the terms in the default conditions
 _CENTERED = 100.0  # of the mean terms' squared distance from there: what all photographs share is in the ink
 _RIDGE = 0.05  # of the photographs' terms, per squared unit: keeps what cells cannot tell near its default
 _LOG_GAIN = (-1.0, 1.0)
@@ -60,7 +61,8 @@ def ink_light(printed: Tensor, ink: Tensor) -> Tensor:
 
 
 def photo_light(light: Tensor, terms: Tensor) -> Tensor:
-    """Return the light N×3 that photographs show; `terms` N×10 (dot gain, density, chroma, veil, log gains, tone)."""
+    """Return the light N×3 that photographs show; `terms` N×12 (dot gain, density, chroma, then
+    veil, log gains, tone by channel)."""
     seen = vary_print(light, terms[:, :6]) * terms[:, 6:9].exp()
     return linear_from_srgb(lift_tone(srgb_from_linear(seen.clamp(1e-6, 1)), terms[:, 9:]))
 
@@ -69,7 +71,7 @@ def fit_printer(cells: KnownColors, start: Printer) -> Printer:
     """Fit the ink's quadratic 10×3 after `start`, with the terms of every photograph; white is the printer's paper."""
     photos, index = np.unique(cells.photo, return_inverse=True)
     printed, seen = _printed(cells.code, start), _tensor(cells.light).clamp(0, 1)
-    ink, terms = torch.zeros(10, 3, dtype=torch.float64), torch.zeros(len(photos), 8, dtype=torch.float64)
+    ink, terms = torch.zeros(10, 3, dtype=torch.float64), torch.zeros(len(photos), len(_CENTER), dtype=torch.float64)
     ink[1:4] = torch.eye(3)
     ink.requires_grad_()
     terms.requires_grad_()
@@ -96,11 +98,13 @@ def fit_photo(cells: KnownColors, printer: Printer) -> np.ndarray:
     """
     light, lab = linear_from_srgb(_printed(cells.code, printer)), lab_from_linear(cells.light)
     table = PrinterSettings()
-    bounds = [table.dot_gain, table.density, table.chroma, *[table.veil] * 3, *[_LOG_GAIN] * 3, CameraSettings().tone]
+    tones = [CameraSettings().tone] * 4
+    bounds = [table.dot_gain, table.density, table.chroma, *[table.veil] * 3, *[_LOG_GAIN] * 3, *tones]
     low, high = np.array(bounds, float).T
 
     def shown(terms: np.ndarray) -> np.ndarray:
-        return photo_light(light, _tensor(terms).expand(len(light), len(bounds))).numpy()
+        drawn = np.concatenate([terms[:9], tone_by_channel(*terms[9:, None])[0]])
+        return photo_light(light, _tensor(drawn).expand(len(light), len(drawn))).numpy()
 
     def distances(terms: np.ndarray) -> np.ndarray:
         return ciede2000(lab_from_linear(shown(terms)), lab)

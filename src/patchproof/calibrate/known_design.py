@@ -136,7 +136,11 @@ def calibrate_design(
         + (" of a place that was left out" if left_out else "; one place does not show how places differ"),
         "photographs": [
             {"file": file, "place": number + 1, "delta_e00": round(error, 2), "veil": np.round(t[:3], 4).tolist()}
-            | {"gains": np.round(np.exp(t[3:6]), 3).tolist(), "tone": round(t[6], 3), "chroma": round(t[7], 3)}
+            | {
+                "gains": np.round(np.exp(t[3:6]), 3).tolist(),
+                "tone": np.round(t[6:9], 3).tolist(),
+                "chroma": round(t[9], 3),
+            }
             for file, number, error, t in zip(files, numbers, errors, [t.tolist() for t in terms], strict=True)
         ],
     }

@@ -47,7 +47,7 @@ def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True) -> 
     light = motion_blur(light, tensor(sensor.motion_px * scale), sensor.motion_deg)
     light = light * gains(sensor, linear)[:, :, None, None]
     picture = encode_light(add_noise(light, tensor(sensor.noise * scale), sensor.noise_seed))
-    picture = lift_tone(picture, tensor(sensor.tone)[:, None, None, None])
+    picture = lift_tone(picture, tensor(sensor.tone)[..., None, None])
     return compress_jpeg(picture, tensor(sensor.jpeg)) if _has_jpeg(sensor, scale, jpeg) else picture
 
 

@@ -34,13 +34,13 @@ _STEPS = 4  # of a photograph's fit in each round
 _LAB_NOISE = 1.0  # CIELAB distances below count by their square
 _LIGHT_NOISE = 0.02  # likewise for light, in the eye's steps
 _PROBE = 1e-4  # of finite differences
-_FARTHEST = np.array([0.5] * 3 + [2.0] * 3 + [MAX_TONE, 0.8])  # what terms may move from their start
+_FARTHEST = np.array([0.5] * 3 + [2.0] * 3 + [MAX_TONE] * 3 + [0.8])  # what terms may move from their start
 
 
 @dataclass(frozen=True)
 class CellColors:
     """Cells of one photograph: `promised` light N×3 of the known printer, its mean `terms` N×9, light as `seen` N×3,
-    and `start` (8,), the photograph's terms as far as known: veil and log gains by channel, tone, chroma.
+    and `start` (10,), the photograph's terms as far as known: veil, log gains and tone by channel, chroma.
     """
 
     promised: np.ndarray
@@ -59,21 +59,21 @@ class CellColors:
 
 @dataclass(frozen=True)
 class ShownColors:
-    """What a photograph makes of a print's light: `matrix` (3×4) maps it, then middle gray rises by `tone`. `kind` says
-    how it was found: "terms", "affine12" or "white_black".
+    """What a photograph makes of a print's light: `matrix` (3×4) maps it, then middle gray rises by `tone` (3). `kind`
+    says how it was found: "terms", "affine12" or "white_black".
     """
 
     matrix: np.ndarray
-    tone: float = 0.0
+    tone: np.ndarray | float = 0.0
     kind: str = "terms"
 
     @staticmethod
     def of_terms(terms: np.ndarray) -> "ShownColors":
-        """Return the colors of `terms`: veil (3), log gains (3), tone, chroma; 0 has no effect. `B×8` show `B×N×3`."""
-        veil, gains, tone, chroma = terms[..., :3], np.exp(terms[..., 3:6]), terms[..., 6:7, None], terms[..., 7:, None]
+        """Return the colors of `terms`: veil, log gains, tone (3 each), chroma; 0 has no effect. B×10 show B×N×3."""
+        veil, gains, chroma = terms[..., :3], np.exp(terms[..., 3:6]), terms[..., 9:, None]
         mixing = (1 + chroma) * np.eye(3) - chroma * np.array(LUMINANCE)
         matrix = np.concatenate([(gains * (1 - veil))[..., None] * mixing, (gains * veil)[..., None]], -1)
-        return ShownColors(matrix, tone if terms.ndim > 1 else float(tone[0, 0]))  # pyright: ignore[reportArgumentType]
+        return ShownColors(matrix, terms[..., 6:9] if terms.ndim == 1 else terms[..., None, 6:9])
 
     def show(self, light: np.ndarray) -> np.ndarray:
         """Return the light `... × 3` that the photograph shows of a print's light."""
@@ -85,9 +85,9 @@ class ShownColors:
         return (lower_light(seen, self.tone) - self.matrix[:, 3]) @ np.linalg.inv(self.matrix[:, :3]).T
 
 
-def lower_light(light: np.ndarray, tone: float) -> np.ndarray:
+def lower_light(light: np.ndarray, tone: np.ndarray | float) -> np.ndarray:
     """Return light as it was before a photograph's tone (`lift_tone`) was applied."""
-    if not tone:
+    if not np.any(tone):
         return light
     codes, slope = srgb_from_linear(light), 1 + 4 * tone
     return linear_from_srgb(2 * codes / (slope + np.sqrt(np.maximum(slope**2 - 16 * tone * codes, 0))))
@@ -128,12 +128,12 @@ def choose_cells(
         np.concatenate([means[:, :3], ends]),
         np.concatenate([means[:, 3:], added_terms(ends).T]),
         np.concatenate([seen.reshape(-1, 3)[chosen], seen_ends]),
-        np.concatenate([np.zeros(3), np.log(np.maximum(paper, 1e-3)), np.zeros(2)]),
+        np.concatenate([np.zeros(3), np.log(np.maximum(paper, 1e-3)), np.zeros(4)]),
     )
 
 
 def fit_ink_and_photos(photos: Sequence[CellColors], rounds: int = 8) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Fit the print's ink 9×3 and photographs' terms (8,) in turn; terms that all share move to the ink."""
+    """Fit the print's ink 9×3 and photographs' terms (10,) in turn; terms that all share move to the ink."""
     terms = [cells.start for cells in photos]
     promised, rows = (np.concatenate([getattr(cells, name) for cells in photos]) for name in ("promised", "terms"))
     ink = np.zeros((INK_TERMS, 3))
@@ -219,10 +219,10 @@ def _fit_terms(light: np.ndarray, cells: CellColors, terms: np.ndarray, steps: i
     apart = miss(terms)
     best = cost(apart, terms)
     for _ in range(steps):
-        slopes = (miss(terms + _PROBE * np.eye(8)) - apart) / _PROBE
+        slopes = (miss(terms + _PROBE * np.eye(len(terms))) - apart) / _PROBE
         weight = 1 / np.sqrt((apart**2).sum(1) + _LAB_NOISE**2)[:, None] / len(light)
-        flat, weighted = slopes.reshape(8, -1), (slopes * weight).reshape(8, -1)
-        square = weighted @ flat.T + 2 * _TERMS_RIDGE * np.eye(8)
+        flat, weighted = (each.reshape(len(terms), -1) for each in (slopes, slopes * weight))
+        square = weighted @ flat.T + 2 * _TERMS_RIDGE * np.eye(len(terms))
         slope = weighted @ apart.ravel() + 2 * _TERMS_RIDGE * (terms - cells.start)
         step = np.linalg.solve(square + damping * np.diag(np.diag(square)), slope)
         moved = cells.start + np.clip(terms - step - cells.start, -_FARTHEST, _FARTHEST)

@@ -122,7 +122,7 @@ def unmix_markers(
     return None if agreement < _LEAST_AGREEMENT else (replace(light, paper=paper, ink=ink), blur_px)
 
 
-def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) -> ShownColors:
+def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: np.ndarray | float = 0.0) -> ShownColors:
     """Fit a photograph's light before its `tone` to media-relative light by paper white and a veil of stray light.
 
     A veil lightens all pixels alike: it is at most the darkest place's light, and at most what takes marker black to
@@ -136,9 +136,10 @@ def light_fit(shot: PhotoSquare, promised: PromisedColors, tone: float = 0.0) ->
     return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
 
 
-def _light_before(shot: PhotoSquare, tone: float) -> np.ndarray:
+def _light_before(shot: PhotoSquare, tone: np.ndarray | float) -> np.ndarray:
     """The square's linear light before the photograph's tone, float32 W×W×3."""
-    return lower_light(LINEAR_FLOAT32_FROM_CODE, tone).astype(np.float32)[shot.square]
+    light = lower_light(np.repeat(LINEAR_FLOAT32_FROM_CODE[:, None], 3, 1), tone)
+    return cv2.LUT(shot.square, light.astype(np.float32)[None])
 
 
 def read_print(shots: Sequence[PhotoSquare], promised: PromisedColors) -> PhotographedPrint:
@@ -204,8 +205,9 @@ def reprojected_square(shot: PhotoSquare, look: Pyramid, rect_mm: Rect, light: S
     return picture
 
 
-def _codes(linear: np.ndarray, tone: float) -> np.ndarray:
-    return lift_tone(srgb_from_linear(linear), tone) if tone else srgb_from_linear(linear)
+def _codes(linear: np.ndarray, tone: np.ndarray | float) -> np.ndarray:
+    codes = srgb_from_linear(linear)
+    return lift_tone(codes, np.asarray(tone, codes.dtype)) if np.any(tone) else codes
 
 
 def _affected_part(shot: PhotoSquare, rect_mm: Rect) -> tuple[slice, slice]:

@@ -107,25 +107,25 @@ class Views:
     def bare_exposed(self) -> Tensor:
         """The bare object, its outlines jagged, in a camera without blur and noise, N·H·W × 3 sRGB."""
         # the background has 256 codes per view and channel, which are exposed as a table
-        gain, tone = self._sensor_values.double().split([3, 1], 1)
-        codes = lift_tone(encode_light(torch.tensor(LINEAR_FROM_CODE)[:, None] * gain[:, None]), tone[:, None])
+        gain, tone = self._sensor_values.double()[:, None].split(3, 2)
+        codes = lift_tone(encode_light(torch.tensor(LINEAR_FROM_CODE)[:, None] * gain), tone)
         image = _look_up_codes(self.background, codes.numpy(), self.stage.device)
         if self.object is None:
             return image
-        gain, tone = self._sensor_on_device.index_select(0, self.object.view).split([3, 1], 1)
+        gain, tone = self._sensor_on_device.index_select(0, self.object.view).split(3, 1)
         color = encode_light_by_table(self._object_color() * gain)
         return image.index_copy_(0, self.object.pixel, lift_tone(color, tone))
 
     def encode(self, light: Tensor, view: Tensor) -> Tensor:
         """Return the code values P×3 of light at pixels of the views P, in a camera without blur and noise."""
-        gain, tone = self._sensor_on_device.index_select(0, view).split([3, 1], 1)
+        gain, tone = self._sensor_on_device.index_select(0, view).split(3, 1)
         return lift_tone(encode_light(light * gain), tone)
 
     @cached_property
     def _sensor_values(self) -> Tensor:
-        """Each view's gains and tone, N×4, here: a device is not waited for."""
+        """Each view's gains and tones, N×6, here: a device is not waited for."""
         tone = torch.as_tensor(self.conditions.sensor.tone, dtype=torch.float32)
-        return torch.cat([gains(self.conditions.sensor, tone), tone[:, None]], 1)
+        return torch.cat([gains(self.conditions.sensor, tone), tone], 1)
 
     @cached_property
     def _sensor_on_device(self) -> Tensor:
