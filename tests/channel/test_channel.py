@@ -8,7 +8,7 @@ import torch
 from kornia.filters import filter2d, gaussian_blur2d
 from tolerances import BY_TABLE, CODE
 
-from patchproof.base.color import linear_from_srgb
+from patchproof.base.color import MAX_TONE, lift_tone, linear_from_srgb
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validate_model
 from patchproof.channel.camera import (
@@ -23,6 +23,7 @@ from patchproof.channel.camera import (
     is_pointwise,
     motion_blur,
 )
+from patchproof.channel.effects import tone_by_channel
 from patchproof.scene.conditions import draw
 
 
@@ -200,3 +201,14 @@ def test_blur_and_motion_are_kornias_to_the_bit(shape, colors_side_by_side):
     assert torch.equal(
         motion_blur(photos, lengths, angles), filter2d(photos, _streaks(lengths, angles), border_type="replicate")
     )
+
+
+def test_channels_have_tones_of_their_own_in_each_session_that_stay_monotonic():
+    tones = draw(SceneSettings.model_construct(), "promise", 400, 0, per_session=4).sensor.tone
+    mean = tones.mean(1)
+    apart = (tones - mean[:, None]).reshape(100, 4, 3)
+    assert np.abs(apart - apart[:, :1]).max() < 1e-12 and 0.03 < np.abs(apart).max() < 0.04
+    assert np.abs(mean).max() < 0.06 and np.ptp(mean.reshape(100, 4), axis=1).min() > 0  # each photograph's own
+    widest = tone_by_channel(np.array([MAX_TONE]), *MAX_TONE * np.array([[1], [-1], [-1]]))
+    assert (np.diff(lift_tone(np.linspace(0, 1, 256)[:, None], widest), axis=0) > 0).all()
+    assert (tone_by_channel(*np.zeros((4, 1))) == 0).all()

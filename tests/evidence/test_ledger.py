@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from itertools import product
 
 import cv2
@@ -12,6 +13,7 @@ import torch
 from synthetic_photos import CONDITION, make_manifest, noisy_design, page_raster, photograph, save, view
 
 from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb
+from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.progress import Compute
 from patchproof.channel.print_colors import ShownColors, add_ink, fit_ink_and_photos
 from patchproof.channel.printer import identity_printer, load_printer
@@ -363,6 +365,11 @@ def test_a_piece_put_into_a_photograph_is_what_a_photograph_of_it_shows():
     put = reprojected_squares(shot, {(): [drawn]}, surface.rect_mm, shown, shown, Reference(0.5, 0.3, 0.0))
     as_taken = reprojected_square(shot, [drawn], surface.rect_mm, shown)
     np.testing.assert_allclose(put[True, True], as_taken, rtol=0, atol=1e-6)
+    toned = reprojected_square(shot, [drawn], surface.rect_mm, replace(shown, tone=np.array([0.08, -0.05, 0.02])))
+    outline = apply_homography(shot.px_from_mm, rect_corners(surface.rect_mm)).round().astype(np.int32)
+    printed = cv2.dilate(cv2.fillConvexPoly(np.zeros(shot.square.shape[:2], np.uint8), outline, 1), None, iterations=8)
+    off = np.abs(toned - shot.square / 255)[printed == 0]  # tones of the channels leave alone what surrounds the print
+    assert off.max() < 0.02 < np.abs(toned - as_taken).max()
     for on, expected in ((True, other), (False, promised_one)):
         off = np.abs(put[on, on] - square_of(expected)[0] / 255).mean()
         assert off < 0.009  # the print that was taken is 0.036 off and more

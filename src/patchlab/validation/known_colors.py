@@ -61,8 +61,7 @@ def ink_light(printed: Tensor, ink: Tensor) -> Tensor:
 
 
 def photo_light(light: Tensor, terms: Tensor) -> Tensor:
-    """Return the light N×3 that photographs show; `terms` N×12 (dot gain, density, chroma, then
-    veil, log gains, tone by channel)."""
+    """Return the light N×3 that photographs show; `terms` N×12: dot gain, density, chroma; veil, log gains, tones."""
     seen = vary_print(light, terms[:, :6]) * terms[:, 6:9].exp()
     return linear_from_srgb(lift_tone(srgb_from_linear(seen.clamp(1e-6, 1)), terms[:, 9:]))
 
@@ -97,8 +96,7 @@ def fit_photo(cells: KnownColors, printer: Printer) -> np.ndarray:
     photograph's in ΔE00. How the light of paper was read, a gain for each channel, is free.
     """
     light, lab = linear_from_srgb(_printed(cells.code, printer)), lab_from_linear(cells.light)
-    table = PrinterSettings()
-    tones = [CameraSettings().tone] * 4
+    table, tones = PrinterSettings(), [CameraSettings().tone] * 4
     bounds = [table.dot_gain, table.density, table.chroma, *[table.veil] * 3, *[_LOG_GAIN] * 3, *tones]
     low, high = np.array(bounds, float).T
 

@@ -117,8 +117,7 @@ def _printers(settings: RealPrintsSettings, every: Cells) -> dict[str, tuple[Pri
         if settings.left_out == "nothing":
             printer = load_printer(PrinterSettings().profile)
         else:
-            others = np.setdiff1d(np.unique(some.photo), held)
-            printer = fit_printer(some.of(others), load_printer(_BASE))
+            printer = fit_printer(some.of(np.setdiff1d(np.unique(some.photo), held)), load_printer(_BASE))
         found[group] = printer, held
     return found
 
@@ -148,9 +147,8 @@ def _share_within(light: torch.Tensor, seen: np.ndarray, draws: int) -> float:
     for effect in map(EFFECT_BY_NAME.__getitem__, ("dot gain", "ink density", "chroma", "veil", "tone")):
         drawn |= effect.sample(defaults, rng.random((draws, len(effect.columns))), np.arange(draws))
     tone = torch.as_tensor(drawn.pop("tone"))
-    change = torch.as_tensor(print_change(Print(**drawn)))
-    made = [vary_print(light, each) for each in change]
-    shown = torch.stack([lift_tone(srgb_from_linear(m), t) for m, t in zip(made, tone, strict=True)]).numpy()
+    made = vary_print(light, torch.as_tensor(print_change(Print(**drawn)))[:, None])
+    shown = lift_tone(srgb_from_linear(made), tone[:, None]).numpy()
     codes = srgb_from_linear(seen)
     return float(((codes >= shown.min(0) - 1e-3) & (codes <= shown.max(0) + 1e-3)).all(1).mean())
 

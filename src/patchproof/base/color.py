@@ -17,6 +17,7 @@ ArrayOrTensor = TypeVar("ArrayOrTensor")  # a function returns the kind that it 
 LUMINANCE = (0.2126390, 0.7151687, 0.0721923)  # Y of sRGB's linear primaries, D65
 _XYZ_FROM_LINEAR = ((0.4123908, 0.3575843, 0.1804808), LUMINANCE, (0.0193308, 0.1191948, 0.9505322))
 _WHITE_D65 = (0.9504559, 1.0, 1.0890578)  # the matrix's own row sums, so that sRGB white is exactly L* 100, a* b* 0
+MAX_TONE = 0.24  # from 0.25 on a tone curve is not monotonic
 
 
 def linear_from_srgb(srgb: ArrayOrTensor) -> ArrayOrTensor:

@@ -131,8 +131,7 @@ def fit_homography(source, target) -> np.ndarray:
     ones, zeros = np.ones((len(a), 1)), np.zeros((len(a), 3))
     a1 = np.hstack([a, ones])
     rows = np.vstack([np.hstack([a1, zeros, -b[:, :1] * a1]), np.hstack([zeros, a1, -b[:, 1:] * a1])])
-    homography = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    return normalize_homography(np.linalg.inv(to_b) @ homography @ to_a)
+    return normalize_homography(np.linalg.inv(to_b) @ np.linalg.svd(rows)[2][-1].reshape(3, 3) @ to_a)
 
 
 def corner_turns(quad) -> np.ndarray:

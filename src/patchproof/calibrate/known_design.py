@@ -122,6 +122,7 @@ def calibrate_design(
     shown = codes + near * (srgb_from_linear(add_ink(linear_from_srgb(codes), ink)) + mean - codes)
     one_of_volume = np.unique(np.round(lab / 5), axis=0, return_index=True)[1]
     covered = float((apart[one_of_volume] <= COVERED_DELTA_E00).mean())
+    rounded = [np.concatenate([t[:3], np.exp(t[3:6]), t[6:]]).round(4).tolist() for t in terms]
     provenance: dict[str, Any] = {
         "source": f"{len(photos)} photographs of a known design in {count} place{'s' * (count > 1)}",
         "model_of": "appearance: what all photographs share, of printer, phone or light, is in the ink",
@@ -135,13 +136,9 @@ def calibrate_design(
         "uncertainty": f"ΔE00 {np.median(left_out or errors):.1f} of cells in the median photograph"
         + (" of a place that was left out" if left_out else "; one place does not show how places differ"),
         "photographs": [
-            {"file": file, "place": number + 1, "delta_e00": round(error, 2), "veil": np.round(t[:3], 4).tolist()}
-            | {
-                "gains": np.round(np.exp(t[3:6]), 3).tolist(),
-                "tone": np.round(t[6:9], 3).tolist(),
-                "chroma": round(t[9], 3),
-            }
-            for file, number, error, t in zip(files, numbers, errors, [t.tolist() for t in terms], strict=True)
+            {"file": file, "place": number + 1, "delta_e00": round(error, 2)}
+            | {"veil": t[:3], "gains": t[3:6], "tone": t[6:9], "chroma": t[9]}
+            for file, number, error, t in zip(files, numbers, errors, rounded, strict=True)
         ],
     }
     return printer_of(name, lambda colors: shown, provenance), tuple(warnings)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from patchproof.base.color import LUMINANCE, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import LUMINANCE, MAX_TONE, lab_from_linear, lift_tone, linear_from_srgb, srgb_from_linear
 
 INK_TERMS = 9
 LEAST_COLORS = 8  # 12 numbers from 24 values; with fewer a single bad color spoiled the map
@@ -27,7 +27,6 @@ _CONVERGED = 1e-3  # smaller changes of weights change no printed digit
 _MOST_CELLS = 600  # of a photograph enter the fit
 _EVEN_SHARE = 0.7  # of the cells
 CELLS_PER_ANCHOR = 8  # paper and ink each enter once for so many: a design's colors do not fix white and black
-MAX_TONE = 0.2  # from 0.25 on a tone curve is not monotonic
 _INK_RIDGE = 0.03  # weight of a term's prior, in cells: few noisy ones make no other print, and many say what it is
 _TERMS_RIDGE = 0.05  # of a photograph's terms, per squared unit: keeps what cells cannot tell near its start
 _STEPS = 4  # of a photograph's fit in each round

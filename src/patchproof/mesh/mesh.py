@@ -63,8 +63,7 @@ class Mesh:
         """Return triangles F×3×3 in their order, without those that cannot come within a reach of a thing that lies
         `vertex_mm` V from each vertex.
         """
-        near = vertex_mm <= reach_mm + self._longest_edge_mm
-        return self.vertices[self.faces[near[self.faces].any(1)]]
+        return self.vertices[self.faces[(vertex_mm <= reach_mm + self._longest_edge_mm)[self.faces].any(1)]]
 
     @cached_property
     def _longest_edge_mm(self) -> float:

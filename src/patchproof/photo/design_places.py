@@ -163,8 +163,7 @@ def places_by_templates(photo: SearchedPhoto, design: np.ndarray, size_mm: tuple
             angle = np.radians(turn)
             back = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
             for peak, rect in _correlation_peaks(turned, templates):
-                quad = rect_corners(rect) - middle
-                found.append((peak, (quad @ back + middle) / scale))
+                found.append((peak, ((rect_corners(rect) - middle) @ back + middle) / scale))
         longer_px *= _TEMPLATE_STEP
     kept: list[np.ndarray] = []
     for _, quad in sorted(found, key=lambda pair: -pair[0]):
@@ -176,17 +175,14 @@ def places_by_templates(photo: SearchedPhoto, design: np.ndarray, size_mm: tuple
 
 def _templates(drawn: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
     """Yield the sizes (width, height) of a design's slants that fit into a picture H×W, and their spectra."""
+    transform_size = [cv2.getOptimalDFTSize(side) for side in shape]
     for slant in _SLANTS:
         size = width, height = max(6, round(drawn.shape[1] / 4 * slant)), max(6, round(drawn.shape[0] / 4))
         if width < shape[1] and height < shape[0]:
             planes = np.array(cv2.split(cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)), np.float32)
             planes -= planes.mean((1, 2), keepdims=True)
             planes /= max(float(np.linalg.norm(planes)), 1e-6)
-            yield size, np.conj(np.asarray(fft.rfft2(planes, _transform_size(shape))))
-
-
-def _transform_size(shape: tuple[int, ...]) -> tuple[int, int]:
-    return cv2.getOptimalDFTSize(shape[0]), cv2.getOptimalDFTSize(shape[1])
+            yield size, np.conj(np.asarray(fft.rfft2(planes, transform_size)))
 
 
 def _correlation_peaks(
@@ -195,18 +191,15 @@ def _correlation_peaks(
     """Yield each template's greatest correlation with the picture, whose deviation counts as a code value at least, and
     its rectangle there. One transform of the picture serves all templates, which OpenCV's matching would repeat.
     """
-    planes, size = np.array(cv2.split(srgb), np.float32) - 127.5, _transform_size(srgb.shape[:2])
+    planes, size = np.array(cv2.split(srgb), np.float32) - 127.5, [cv2.getOptimalDFTSize(s) for s in srgb.shape[:2]]
     seen, power = np.asarray(fft.rfft2(planes, size)), (planes**2).sum(0)
     for (width, height), spectra in templates:
         rows, columns = srgb.shape[0] - height + 1, srgb.shape[1] - width + 1
-        sums, pixels = [_box(plane, width, height) for plane in planes], width * height
-        variance = _box(power, width, height) - sum(each**2 for each in sums) / pixels
+        box, pixels = {"ksize": (width, height), "anchor": (0, 0), "normalize": False}, width * height
+        # sums over the rectangle whose top left pixel each one is
+        *sums, squares = (cv2.boxFilter(plane, -1, **box) for plane in (*planes, power))
+        variance = squares - sum(each**2 for each in sums) / pixels
         product = np.asarray(fft.irfft2((seen * spectra).sum(0), size))
         likeness = product[:rows, :columns] / np.sqrt(variance[:rows, :columns].clip(0) + 3 * pixels)
         _, peak, _, (x, y) = cv2.minMaxLoc(likeness)
         yield peak, (x, y, width, height)
-
-
-def _box(plane: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Sums over the rectangle whose top left pixel each one is."""
-    return cv2.boxFilter(plane, -1, (width, height), anchor=(0, 0), normalize=False)

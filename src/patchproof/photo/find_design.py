@@ -197,7 +197,8 @@ class _SmallDesign:
     by up to a pixel where gain and offset are all that may change.
     """
 
-    def __init__(self, drawn: np.ndarray, surroundings: float):
+    def __init__(self, pixels: bytes, shape: tuple[int, ...], size_mm, longer_px: float, surroundings: float):
+        drawn = draw_design(np.frombuffer(pixels, np.uint8).reshape(shape), size_mm, longer_px)
         self.size, sigma_px = (drawn.shape[1], drawn.shape[0]), surroundings * max(drawn.shape[:2])
         blur = {"kernelX": np.ones(1), "kernelY": cv2.getGaussianKernel(2 * round(4 * sigma_px) + 1, sigma_px)}
         eyes, edges = (np.eye(side, dtype=np.float32) for side in drawn.shape[:2]), cv2.BORDER_REPLICATE
@@ -277,12 +278,7 @@ class _SmallDesign:
         return corners, likeness, _corner_sigma(px_from_unit, np.linalg.inv(hessian) * variance)
 
 
-@lru_cache(maxsize=32)  # the design and its mirror image at the sizes that one photograph after the other asks for
-def _small_design(
-    pixels: bytes, shape: tuple[int, ...], size_mm: tuple[float, float], longer_px: float, surroundings: float
-) -> _SmallDesign:
-    design = np.frombuffer(pixels, np.uint8).reshape(shape)
-    return _SmallDesign(draw_design(design, size_mm, longer_px), surroundings)
+_small_design = lru_cache(maxsize=32)(_SmallDesign)  # at the sizes that one photograph after the other asks for
 
 
 def _mixture(colors: np.ndarray, seen: np.ndarray) -> np.ndarray:

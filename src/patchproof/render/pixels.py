@@ -51,8 +51,7 @@ class PiecePicture:
     def srgb(self) -> Tensor:
         """The picture H×W×3."""
         width, height = self.size_px
-        finest = self.codes[: (height + 1) * (width + 1)]
-        return finest.view(height + 1, width + 1, 3)[:height, :width]
+        return self.codes[: (height + 1) * (width + 1)].view(height + 1, width + 1, 3)[:height, :width]
 
     @cached_property
     def light(self) -> Tensor:

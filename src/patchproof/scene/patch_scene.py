@@ -172,7 +172,10 @@ def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, 
         # were readable, of 40 to 90 mm 26 of 168 where 21 to 100 % were.
         few = "few photographs of rolled paper under 100 mm can be measured: the others only count"
         notes += (few,) if min(patch.size_mm) < 100 else ()
-    shown = _in_picture(scene, placement, poses)
+    corners = placement.world(geometry.rect_corners((0, 0, *placement.size_mm)))
+    pixels = geometry.project(scene.matrix_px(scene.photo_px), poses, corners)
+    # with three corners of the piece or more, without which no sheet can be measured
+    shown = ((pixels >= 0) & (pixels <= scene.photo_px)).all(2).sum(1) >= 3
     if shown.mean() < interface.READABLE_SHARE:
         advice = "raise view.fov_deg or view.distance_mm, or lower view.look_at_jitter"
         notes += (f"the piece lies beyond the edge of the picture in {1 - shown.mean():.0%} of photographs: {advice}",)
@@ -186,13 +189,6 @@ def _place_piece(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, 
         measurable = interface.measurable_text(unreadable, placement.family)
         notes += (f"{measurable}: others show markers of {marker_mm:.1f} mm too small: {advice}",)
     return piece, placement, unreadable, notes
-
-
-def _in_picture(scene: MeshScene, placement: Placement, poses: np.ndarray) -> np.ndarray:
-    """True for each view that shows three of the piece's corners or more, without which no sheet can be measured."""
-    corners = placement.world(geometry.rect_corners((0, 0, *placement.size_mm)))
-    pixels = geometry.project(scene.matrix_px(scene.photo_px), poses, corners)
-    return ((pixels >= 0) & (pixels <= scene.photo_px)).all(2).sum(1) >= 3
 
 
 def _smallest_scales(scene: MeshScene, card: Placement, poses: np.ndarray) -> np.ndarray:
