@@ -231,7 +231,7 @@ def test_promises_in_the_readme_are_those_by_the_default_conditions():
     promised, seen = np.hstack([shown_by_run(name) for name in names])
     off = student_mean(100 * (seen - promised))
     said = f"{count} of {n} sessions that a path tracer photographed, "
-    said += f"{off.value:+.1f} points [{off.low:.1f}, {off.high:.1f}] beyond them"
+    said += f"{off.value:+.1f} points [{off.low:.1f}, {off.high:.1f}] beyond them".replace("-0.0", "0.0")
     assert len(seen) == 20 and said in words(README)
 
 
