@@ -206,7 +206,8 @@ def reprojected_square(shot: PhotoSquare, look: Pyramid, rect_mm: Rect, light: S
 
 
 def _codes(linear: np.ndarray, tone: np.ndarray | float) -> np.ndarray:
-    return lift_tone(srgb_from_linear(linear), np.asarray(tone, linear.dtype))
+    codes = srgb_from_linear(linear)
+    return lift_tone(codes, np.asarray(tone, codes.dtype)) if np.any(tone) else codes
 
 
 def _affected_part(shot: PhotoSquare, rect_mm: Rect) -> tuple[slice, slice]:

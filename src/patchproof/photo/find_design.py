@@ -278,7 +278,7 @@ class _SmallDesign:
         return corners, likeness, _corner_sigma(px_from_unit, np.linalg.inv(hessian) * variance)
 
 
-_small_design = lru_cache(maxsize=32)(_SmallDesign)  # at the sizes that one photograph after the other asks for
+_small_design = lru_cache(maxsize=16)(_SmallDesign)  # at most 3 MB each; their sizes recur in photographs
 
 
 def _mixture(colors: np.ndarray, seen: np.ndarray) -> np.ndarray:
