@@ -203,12 +203,12 @@ def test_how_vague_cells_are_and_how_well_codes_agree_are_numpy_s_own(piece):
     centers = np.mgrid[1:6, 1:6].reshape(2, -1) * 10 + 5
     light = edges.sample(luminance(srgb), centers.T[:, ::-1].astype(float))
     expected = np.corrcoef(light, code[1:-1, 1:-1].ravel())[0, 1]
-    assert known_page._correlation(srgb, quad, code) == pytest.approx(expected, abs=1e-5)
-    assert known_page._correlation(np.full_like(srgb, 9), quad, code) == -1
+    assert known_page._likeness(srgb, quad, code)[0] == pytest.approx(expected, abs=1e-5)
+    assert known_page._likeness(np.full_like(srgb, 9), quad, code)[0] == 0
 
 
 @pytest.mark.parametrize(("marker_px", "seen"), [(10, True), (6, False)])
-def test_a_second_print_is_seen_whose_markers_are_too_small_to_be_read(piece, surface, monkeypatch, marker_px, seen):
+def test_a_print_is_seen_whose_markers_are_too_small_to_be_read(piece, surface, monkeypatch, marker_px, seen):
     near = photograph(piece, view(0, 0, 500, 0, (600, 450)), (600, 450), blur_px=0.4)
     first = find_sheet(near, IDS, surface.corners_mm)
     assert first.markers.keys() == IDS and not first.doubled
@@ -217,6 +217,10 @@ def test_a_second_print_is_seen_whose_markers_are_too_small_to_be_read(piece, su
     photo = np.full((450, 1000, 3), 128, np.uint8)
     photo[:, :600], photo[20 : 20 + len(second), 640 : 640 + second.shape[1]] = near, cv2.blur(second, (2, 2))
     assert bool(find_sheet(photo, IDS, surface.corners_mm).doubled) == seen
+    alone = np.ascontiguousarray(photo[:, 600:])
+    assert (len(find_sheet(alone, IDS, surface.corners_mm).markers) > 4) == seen
+    others = {i + 1: corners for i, corners in surface.corners_mm.items()}
+    assert not find_sheet(alone, {i + 1 for i in IDS}, others).markers
     monkeypatch.setattr(known_page, "find_second_print", lambda *given: ((), ()))
     assert not find_sheet(photo, IDS, surface.corners_mm).doubled
 

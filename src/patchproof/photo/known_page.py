@@ -4,11 +4,10 @@ In: the photograph and the place of every marker on the page. Out: `MarkersInVie
 homography from the markers found so far predicts the corners of the missing ones. Where the cells resemble the printed
 ones, borders are fitted from there; a marker counts if they lie near the prediction and its cells match. This needs no
 contours, so it works for small, blurred or partly covered markers, and it saves finer levels, which cost most.
-Prediction never identifies a sheet by itself.
 
-A second print may be too far away for its markers to be read: dark squares are compared with the known codes, and count
-where two or three lie as on the sheet. That works from 8 px across on; at a blur of 0.9 px it works from 10 px on, and
-reading from 14.
+A print, or a second one, may be too far away for its markers to be read: dark squares are compared with the known
+codes, and count where two or three lie as on the sheet. That works from 8 px across on; at a blur of 0.9 px it works
+from 10 px on, and reading from 14.
 """
 
 from collections.abc import Iterator
@@ -28,9 +27,10 @@ from patchproof.sheets.markers import DICTIONARY, aruco_dictionary, marker_cells
 
 # Of the light with the printed cells: blur lowers it to 0.8, and other codes of the dictionary stay below 0.6.
 LEAST_CORRELATION = 0.7
-# Borders, which cost most, are fitted only from here on, at one of the offsets (in modules) about the predicted place.
+# Borders, which cost most, are fitted only from here on, from the best of the offsets (in modules) about the predicted
+# place: two markers 12 px across, the others' diagonal, are off by up to 1.6 modules at the other corners.
 _MIN_TRIAL_CORRELATION = 0.5
-_TRIAL_OFFSETS = tuple((x, y) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4))
+_TRIAL_OFFSETS = np.stack(np.meshgrid(*2 * [np.linspace(-1.6, 1.6, 9)]), -1).reshape(-1, 2)
 # A marker's side in px, 4 a module: the detector reads 99 % of such markers, so one that is missing must be covered.
 READABLE_PX = 28.0
 _LEAST_MARKERS = 3  # with less, flat paper cannot be told from bent
@@ -38,6 +38,7 @@ _LEAST_MARKERS = 3  # with less, flat paper cannot be told from bent
 _FIRST_PX, _MOST_SCALE, _MOST_PIXELS = 70.0, 2.0, 4_500_000
 _LEAST_PX, _LARGEST_SHARE, _MOST_SQUARES = 9.0, 1.2, 300  # sides of squares there; of the first print's markers
 _OFFSETS = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)])  # in modules
+_NO_OFFSET = np.zeros((1, 2))
 _LEAST_LIKENESS = {3: 0.5, 2: 0.7}  # of the cells' light with the codes, by the number of markers that show a print
 _LEAST_OF_ONE = 0.85
 _SQUARES_PER_MARKER = 3  # those most like it
@@ -72,8 +73,9 @@ def find_sheet(srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: s
         if not missing and not unclear:
             break
     fitted = sum(b.fitted for b in view.markers.values())
-    if view.markers and fitted < min(max(_LEAST_MARKERS, len(expected) / 2), len(expected)):
-        # those of a print far away that are read identify it
+    few = fitted < min(max(_LEAST_MARKERS, len(expected) / 2), len(expected)) and not view.another_sheet
+    # a larger picture is reduced, and shows nothing there that cannot be read
+    if few and (view.markers or srgb[..., 0].size <= _MOST_PIXELS):
         small = find_small_markers(srgb, view.corners_px, {i: corners_mm[i] for i in expected}, dictionary)
         detections = {i: [quad] for i, quad in small.items()} | detections
         detected = detect.fit_detections(srgb, detections, set(corners_mm), dictionary)
@@ -120,17 +122,17 @@ def _confirm_markers(srgb, view: MarkersInView, corners_mm, dictionary: str) -> 
         return {}
     ids = sorted(predicted)
     codes = dict(zip(ids, marker_cells(dictionary, ids), strict=True))
-    ids = [i for i in ids if _correlation(srgb, predicted[i], codes[i], _TRIAL_OFFSETS) > _MIN_TRIAL_CORRELATION]
-    if not ids:
+    trials = {i: _likeness(srgb, predicted[i], codes[i], _TRIAL_OFFSETS) for i in ids}
+    rough = {i: corners for i, (likeness, corners) in trials.items() if likeness > _MIN_TRIAL_CORRELATION}
+    if not rough:
         return {}
-    cells = np.array([codes[i] for i in ids])
-    borders = detect.fit_marker_borders(srgb, np.array([predicted[i] for i in ids]), cells)
+    borders = detect.fit_marker_borders(srgb, np.array([*rough.values()]), np.array([codes[i] for i in rough]))
     return {
         i: b
-        for i, b, code in zip(ids, borders, cells, strict=True)
+        for i, b in zip(rough, borders, strict=True)
         if b.fitted
-        and np.linalg.norm(b.corners_px - predicted[i], axis=1).max() < max(0.5 * b.module_px, 1.0)
-        and _correlation(srgb, b.corners_px, code) > LEAST_CORRELATION
+        and np.linalg.norm(b.corners_px - rough[i], axis=1).max() < max(0.5 * b.module_px, 1.0)
+        and _likeness(srgb, b.corners_px, codes[i])[0] > LEAST_CORRELATION
     }
 
 
@@ -158,26 +160,24 @@ def is_in_picture(quad: np.ndarray, srgb: np.ndarray) -> bool:
 
 def shows_small_code(srgb: np.ndarray, quad: np.ndarray, marker_id: int, dictionary: str) -> bool:
     """True if corners 4×2 px lie in the picture, are too small for borders to be fitted, and resemble a marker."""
-    code = marker_cells(dictionary, [marker_id])[0]
     is_small = is_in_picture(quad, srgb) and detect.side_px(quad) < READABLE_PX / 2
-    return is_small and _correlation(srgb, quad, code, _TRIAL_OFFSETS) > LEAST_CORRELATION
+    return is_small and _likeness(srgb, quad, marker_cells(dictionary, [marker_id])[0], _OFFSETS)[0] > LEAST_CORRELATION
 
 
-def _correlation(srgb: np.ndarray, corners_px: np.ndarray, code: np.ndarray, offsets=((0.0, 0.0),)) -> float:
-    """Correlation of the cells' light with the printed pattern, at the best of several offsets in modules."""
+def _likeness(srgb, corners_px: np.ndarray, code: np.ndarray, offsets=_NO_OFFSET) -> tuple[float, np.ndarray]:
+    """Correlation of cells' light with the printed pattern at the best of several offsets in modules; corners there."""
     n = len(code)
     square = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32)
     to_px = cv2.getPerspectiveTransform(square, corners_px.astype(np.float32))
-    rows, columns = np.mgrid[1 : n - 1, 1 : n - 1] + 0.5  # without the black border
-    inner = np.column_stack([columns.ravel(), rows.ravel()])
-    centers = apply_homography(to_px, (np.array(offsets)[:, None] + inner).reshape(-1, 2))
+    inner = np.indices((n - 2, n - 2))[::-1].reshape(2, -1).T + 1.5  # without the black border
+    centers = apply_homography(to_px, (offsets[:, None] + inner).reshape(-1, 2))
     region = region_around(centers, 1, srgb.shape)
     light = detect.luminance(np.ascontiguousarray(srgb[region]))
-    cells = sample(light, centers - [region[1].start, region[0].start]).reshape(len(offsets), -1)
-    values, printed = cells[cells.std(1) > 1e-6], code[1:-1, 1:-1].ravel()
-    values, printed = values - values.mean(1, keepdims=True), printed - printed.mean()
-    correlation = values @ printed / (np.linalg.norm(values, axis=1) * np.linalg.norm(printed))
-    return float(correlation.max(initial=-1.0))
+    cells = sample(light, centers - [region[1].start, region[0].start])
+    printed = _normalized(code[1:-1, 1:-1], len(inner))[0]
+    correlation = _normalized(cells, len(inner)) @ printed
+    best = int(correlation.argmax())
+    return float(correlation[best]), apply_homography(to_px, square + offsets[best])
 
 
 def find_second_print(
@@ -222,13 +222,13 @@ def _read_codes(light: np.ndarray, quads: list[np.ndarray], dictionary: str) -> 
 
 
 def find_small_markers(srgb: np.ndarray, read: Quads, corners_mm: Quads, dictionary: str) -> dict[int, np.ndarray]:
-    """Rough corners 4×2 by id of markers too small to be read that lie with those in `read` as on the sheet."""
-    light, scale = _scaled_light(srgb, _MOST_SCALE)
-    matches = _matches(light, _dark_squares(light, _FIRST_PX), sorted(corners_mm), dictionary)
+    """Rough corners 4×2 by id of markers too small to be read that lie as on the sheet, with those in `read` if any."""
+    # of code values: paper's light spreads over borders a pixel or two wide
+    light, scale = _scaled_light(srgb, _MOST_SCALE, detect.code_picture)
     found = {i: quad * scale for i, quad in read.items()}
-    for group in _groups(matches, corners_mm):
-        if any(np.linalg.norm((group[i] - found[i]).mean(0)) < _SAME_PX for i in group.keys() & found.keys()):
-            found = group | found
+    for group in _groups(_matches(light, _dark_squares(light, _FIRST_PX), sorted(corners_mm), dictionary), corners_mm):
+        same = (np.linalg.norm((group[i] - found[i]).mean(0)) < _SAME_PX for i in group.keys() & found.keys())
+        found = group | found if any(same) or _misfit(group | found, corners_mm) < _MOST_MISFIT else found
     return {i: found[i] / scale for i in found.keys() - read.keys()}
 
 
@@ -241,14 +241,14 @@ def _groups(matches: list[Match], corners_mm: Quads) -> Iterator[dict[int, np.nd
                 yield quads
 
 
-def _scaled_light(srgb: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
+def _scaled_light(srgb: np.ndarray, scale: float, to_gray=detect.light_picture) -> tuple[np.ndarray, float]:
     """The picture's light at about this scale, and the scale."""
     scale = min(scale, _MOST_SCALE, float(np.sqrt(_MOST_PIXELS / srgb[..., 0].size)))
     scale = scale if scale >= 1 else 1 / float(np.ceil(1 / scale))  # whole pixels are averaged 20 times as fast
     size = max(1, round(srgb.shape[1] * scale)), max(1, round(srgb.shape[0] * scale))
     if scale < 1:
-        return detect.light_picture(cv2.resize(srgb, size, interpolation=cv2.INTER_AREA)), scale
-    return cv2.resize(detect.light_picture(srgb), size, interpolation=cv2.INTER_CUBIC), scale
+        return to_gray(cv2.resize(srgb, size, interpolation=cv2.INTER_AREA)), scale
+    return cv2.resize(to_gray(srgb), size, interpolation=cv2.INTER_CUBIC), scale
 
 
 def _dark_squares(light: np.ndarray, most_px: float) -> list[np.ndarray]:
@@ -270,7 +270,7 @@ def _matches(light: np.ndarray, quads: list[np.ndarray], ids: list[int], diction
         return []
     cells = marker_cells(dictionary, ids)
     n = cells.shape[1]
-    inner = np.stack(np.meshgrid(np.arange(1, n - 1), np.arange(1, n - 1)), -1).reshape(-1, 2) + 0.5
+    inner = np.indices((n - 2, n - 2))[::-1].reshape(2, -1).T + 1.5
     points = (_OFFSETS[:, None] + inner).reshape(-1, 2)
     square = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32)
     to_px = [cv2.getPerspectiveTransform(square, q.astype(np.float32)) for q in quads]
