@@ -219,8 +219,8 @@ def test_a_print_is_seen_whose_markers_are_too_small_to_be_read(piece, surface, 
     assert bool(find_sheet(photo, IDS, surface.corners_mm).doubled) == seen
     alone = np.ascontiguousarray(photo[:, 600:])
     assert (len(find_sheet(alone, IDS, surface.corners_mm).markers) > 4) == seen
-    others = {i + 1: corners for i, corners in surface.corners_mm.items()}
-    assert not find_sheet(alone, {i + 1 for i in IDS}, others).markers
+    others = {i + 50: corners for i, corners in surface.corners_mm.items()}
+    assert not find_sheet(alone, {i + 50 for i in IDS}, others).markers
     monkeypatch.setattr(known_page, "find_second_print", lambda *given: ((), ()))
     assert not find_sheet(photo, IDS, surface.corners_mm).doubled
 
