@@ -1,10 +1,10 @@
 """Chart where each method breaks: the last good and the first bad point along an axis, and the code that is said there.
 
-In: the demo's scene, and nothing of a run: the sheet's design is noise. A cell is one method along one axis, from easy
-to hard, all else easy; photographs by our renderer are measured as `verify` does and held against the renderer's truth,
-verdicts and promises against sessions drawn at a known rate. A point is good where `MIN_SHARE` of its trials are, of
-promises `MIN_COVERAGE`. Out: both points, the most frequent code of the bad trials, and how many of them nothing was
-said about. A cell ends at the second bad point.
+In: the demo's scene, and nothing of a run: the sheet's design is noise, printed as promised. A cell is one method along
+one axis, from easy to hard, all else easy; photographs by our renderer are measured as `verify` does and held against
+the renderer's truth, verdicts and promises against sessions drawn at a known rate. A point is good where `MIN_SHARE` of
+its trials are, of promises `MIN_COVERAGE`. Out: both points, the most frequent code of the bad trials, and how many of
+them nothing was said about. A cell ends at the second bad point.
 """
 
 from collections import Counter
@@ -123,8 +123,8 @@ def _shoot(axis: str, values: Mapping[str, float], number: int) -> MeasuredShot:
     point["darkness"] -= point.pop("brightness", 0)
     point["distance"] = scene.focal_px * scene.piece.module_mm / point.pop("module_px")
     drawn = conditions_at(scene.draw("reprint", 1, 0, number), point)
-    if axis == "cast":
-        drawn = with_values(drawn, white_balance=drawn.sensor.white_balance * np.array([value, 1, 1 / value]) ** 0.5)
+    balance = drawn.sensor.white_balance * (np.array([value, 1, 1 / value]) ** 0.5 if axis == "cast" else 1)
+    drawn = with_values(drawn, white_balance=balance, dot_gain=0.0, density=0.0, mottle=0.0)
     piece = _piece_under_tape(value) if axis == "hidden" else sheet.piece
     with torch.no_grad():
         srgb = image_pixels(jpeg_of(photograph(stage, piece, drawn, scene.photo_px, jpeg=False), drawn))

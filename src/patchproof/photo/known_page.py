@@ -32,13 +32,12 @@ LEAST_CORRELATION = 0.7
 _MIN_TRIAL_CORRELATION = 0.5
 _TRIAL_OFFSETS = np.stack(np.meshgrid(*2 * [np.linspace(-1.6, 1.6, 9)]), -1).reshape(-1, 2)
 # A marker's side in px, 4 a module: the detector reads 99 % of such markers, so one that is missing must be covered.
-READABLE_PX = 28.0
+READABLE_PX, _UNREAD_PX = 28.0, 18.0  # the latter: where none is read, larger squares are other codes
 _LEAST_MARKERS = 3  # with less, flat paper cannot be told from bent
 # The picture is scaled until the first print's markers have this side; those of one four times as far have 17 px then.
 _FIRST_PX, _MOST_SCALE, _MOST_PIXELS = 70.0, 2.0, 4_500_000
 _LEAST_PX, _LARGEST_SHARE, _MOST_SQUARES = 9.0, 1.2, 300  # sides of squares there; of the first print's markers
 _OFFSETS = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)])  # in modules
-_NO_OFFSET = np.zeros((1, 2))
 _LEAST_LIKENESS = {3: 0.5, 2: 0.7}  # of the cells' light with the codes, by the number of markers that show a print
 _LEAST_OF_ONE = 0.85
 _SQUARES_PER_MARKER = 3  # those most like it
@@ -54,10 +53,8 @@ def find_sheet(srgb: np.ndarray, expected: Ids, corners_mm: Quads, dictionary: s
     one. The search ends when each of `expected` is found, out of the picture or covered, unless a finer level could
     decide about a single foreign marker.
     """
-    aruco = aruco_dictionary(dictionary)
-    detections: Detections = {}
-    borders: dict[int, Borders] = {}
-    mirrored: set[int] = set()
+    aruco, detections = aruco_dictionary(dictionary), Detections()
+    borders, mirrored = dict[int, Borders](), set[int]()
     region, view = detect.full_region(srgb), MarkersInView({}, (), ())
     for level in detect.pyramid_levels(srgb, region):
         count, foreign = sum(map(len, detections.values())), view.foreign
@@ -164,8 +161,8 @@ def shows_small_code(srgb: np.ndarray, quad: np.ndarray, marker_id: int, diction
     return is_small and _likeness(srgb, quad, marker_cells(dictionary, [marker_id])[0], _OFFSETS)[0] > LEAST_CORRELATION
 
 
-def _likeness(srgb, corners_px: np.ndarray, code: np.ndarray, offsets=_NO_OFFSET) -> tuple[float, np.ndarray]:
-    """Correlation of cells' light with the printed pattern at the best of several offsets in modules; corners there."""
+def _likeness(srgb, corners_px: np.ndarray, code: np.ndarray, offsets=_OFFSETS[4:5]) -> tuple[float, np.ndarray]:
+    """Correlation of cells' light with a code at the best of some offsets (none) in modules, and the corners there."""
     n = len(code)
     square = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32)
     to_px = cv2.getPerspectiveTransform(square, corners_px.astype(np.float32))
@@ -174,8 +171,7 @@ def _likeness(srgb, corners_px: np.ndarray, code: np.ndarray, offsets=_NO_OFFSET
     region = region_around(centers, 1, srgb.shape)
     light = detect.luminance(np.ascontiguousarray(srgb[region]))
     cells = sample(light, centers - [region[1].start, region[0].start])
-    printed = _normalized(code[1:-1, 1:-1], len(inner))[0]
-    correlation = _normalized(cells, len(inner)) @ printed
+    correlation = _normalized(cells, len(inner)) @ _normalized(code[1:-1, 1:-1], len(inner))[0]
     best = int(correlation.argmax())
     return float(correlation[best]), apply_homography(to_px, square + offsets[best])
 
@@ -223,13 +219,16 @@ def _read_codes(light: np.ndarray, quads: list[np.ndarray], dictionary: str) -> 
 
 def find_small_markers(srgb: np.ndarray, read: Quads, corners_mm: Quads, dictionary: str) -> dict[int, np.ndarray]:
     """Rough corners 4×2 by id of markers too small to be read that lie as on the sheet, with those in `read` if any."""
-    # of code values: paper's light spreads over borders a pixel or two wide
-    light, scale = _scaled_light(srgb, _MOST_SCALE, detect.code_picture)
-    found = {i: quad * scale for i, quad in read.items()}
-    for group in _groups(_matches(light, _dark_squares(light, _FIRST_PX), sorted(corners_mm), dictionary), corners_mm):
-        same = (np.linalg.norm((group[i] - found[i]).mean(0)) < _SAME_PX for i in group.keys() & found.keys())
-        found = group | found if any(same) or _misfit(group | found, corners_mm) < _MOST_MISFIT else found
-    return {i: found[i] / scale for i in found.keys() - read.keys()}
+    found = dict(read)
+    for to_gray in (detect.light_picture, detect.code_picture):  # codes where paper's light hides thin borders
+        light, scale = _scaled_light(srgb, _MOST_SCALE, to_gray)
+        squares = _dark_squares(light, _FIRST_PX if read else _UNREAD_PX * scale)
+        for scaled in _groups(_matches(light, squares, [*corners_mm], dictionary), corners_mm):
+            group = {i: quad / scale for i, quad in scaled.items()}
+            apart = (scale * np.linalg.norm((group[i] - found[i]).mean(0)) for i in group.keys() & found.keys())
+            joins = min(apart, default=np.inf) < _SAME_PX or _misfit(group | found, corners_mm) < _MOST_MISFIT
+            found = group | found if joins else found
+    return {i: found[i] for i in found.keys() - read.keys()}
 
 
 def _groups(matches: list[Match], corners_mm: Quads) -> Iterator[dict[int, np.ndarray]]:
