@@ -451,9 +451,11 @@ def test_figures_of_terms_are_those_of_the_chart():
     rows = {row[0]: row[2:] for row in stored("charts/terms.json")["tables"]["terms"]["rows"]}
     off = {name: f"{100 * row[0]['value']:.1f}" for name, row in rows.items()}
     page = words(NOTEBOOK)
-    said = "only ambient light ({} points), the printer's colors ({}) and directional light ({}) move some promise"
-    assert said.format(*(off[name] for name in ("ambient light", "printer's colors", "directional light"))) in page
-    assert f"a veil {off['veil']}, chroma {off['chroma']}, exposure {off['exposure']}, all others less" in page
+    said = "only ambient light ({} points) and the printer's colors ({}) move some promise"
+    assert said.format(*(off[name] for name in ("ambient light", "printer's colors"))) in page
+    said = "a veil {}, directional light {}, chroma {}, exposure and tone {}, all others less"
+    assert said.format(*(off[name] for name in ("veil", "directional light", "chroma", "exposure"))) in page
+    assert off["tone"] == off["exposure"]
     cost = [100 * rows["mottle"][3][end] for end in ("value", "low", "high")]
     assert "mottle takes {:.1f} % [{:.1f}, {:.1f}]".format(*cost) in page
     assert f"Mottle moves a promise by {off['mottle']} points" in page
