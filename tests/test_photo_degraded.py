@@ -107,7 +107,7 @@ def test_what_is_called_measured_is_right(kind, tmp_path):
         ("keystone", 19, None),
         ("second_far", 2, "several_sheets"),
         ("flat_far", 22, None),
-        ("flat_far", 23, None),
+        ("flat_far", 52, None),
         ("design_scaled", 8, None),
         ("design_scaled", 1, "curled"),
         ("dog_ear_small", 0, "too_few_markers"),

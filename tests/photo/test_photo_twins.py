@@ -207,7 +207,7 @@ def test_how_vague_cells_are_and_how_well_codes_agree_are_numpy_s_own(piece):
     assert known_page._likeness(np.full_like(srgb, 9), quad, code)[0] == 0
 
 
-@pytest.mark.parametrize(("marker_px", "seen"), [(10, True), (6, False)])
+@pytest.mark.parametrize(("marker_px", "seen"), [(10, True), (9, True), (6, False)])
 def test_a_print_is_seen_whose_markers_are_too_small_to_be_read(piece, surface, monkeypatch, marker_px, seen):
     near = photograph(piece, view(0, 0, 500, 0, (600, 450)), (600, 450), blur_px=0.4)
     first = find_sheet(near, IDS, surface.corners_mm)
@@ -218,7 +218,7 @@ def test_a_print_is_seen_whose_markers_are_too_small_to_be_read(piece, surface, 
     photo[:, :600], photo[20 : 20 + len(second), 640 : 640 + second.shape[1]] = near, cv2.blur(second, (2, 2))
     assert bool(find_sheet(photo, IDS, surface.corners_mm).doubled) == seen
     alone = np.ascontiguousarray(photo[:, 600:])
-    assert (len(find_sheet(alone, IDS, surface.corners_mm).markers) > 4) == seen
+    assert (len(find_sheet(alone, IDS, surface.corners_mm).markers) > 6) == seen
     others = {i + 50: corners for i, corners in surface.corners_mm.items()}
     assert not find_sheet(alone, {i + 50 for i in IDS}, others).markers
     monkeypatch.setattr(known_page, "find_second_print", lambda *given: ((), ()))
