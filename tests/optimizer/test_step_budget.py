@@ -21,11 +21,11 @@ from test_optimize import scene_with
 
 # Of a step of four views, in the two batches that a CPU sees them in, on a carton before a network of one layer, in the
 # mean of four steps: where poses are seen for the first time, as in one step of four, and where they are seen again.
-# Measured: 2,381 and 21; 1,132 and 3.
-OPERATIONS, WAITS = (2_400, 1_150), (23, 3)
-# Measured: 21.5 and 15 sent, 14.5 and 2 fetched. Where poses are seen for the first time, numbers of pixels decide how
+# Measured: 2,275 and 23.5; 1,003 and 3.
+OPERATIONS, WAITS = (2_300, 1_020), (24, 3)
+# Measured: 21.5 and 15 sent, 13 and 2 fetched. Where poses are seen for the first time, numbers of pixels decide how
 # much memory is asked for, and boxes around the piece which layers are computed.
-SENT, FETCHED = (22, 15), (15, 2)
+SENT, FETCHED = (22, 15), (13, 2)
 STAY = {  # in every step, with their reason
     "network.py:logits": "an answer of NaN is refused before it is used",
     "loop.py:_descend": "a step with an infinite gradient is refused",

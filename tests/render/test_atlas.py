@@ -33,8 +33,6 @@ def test_what_is_seen_in_an_atlas_is_what_footprints_see(taps):
     where = atlas_layout(SIZES)
     seen = sample_atlas(where, atlas_table(own, where), *at, taps)
     told = look_up(footprint(texel_layout(list(SIZES), wrap=True), *at, taps), texel_table(own, wrap=True))
-    if taps == 1:
-        assert torch.equal(seen, told)
     torch.testing.assert_close(seen, told, atol=PLACED, rtol=0)
 
 

@@ -95,17 +95,23 @@ def test_barycentrics_land_on_the_pixel_center():
     np.testing.assert_allclose(pixels, centers, atol=1e-3)
 
 
+def derivatives(fragments):
+    """Of the barycentrics, P×3 each, which are 1 at one corner and 0 at the others."""
+    count = int(fragments.seen.max()) + 1 if len(fragments) else 0
+    return fragments.derivatives(torch.eye(3).expand(count, 3, 3), fragments.barycentric)
+
+
 def test_barycentric_derivatives_are_differences_of_barycentrics():
     vertices = torch.tensor([[-2.0, -1, 0], [2, -1, 1], [0, 2, -1]], dtype=torch.float64)
     views = cameras([[0.3, 0.2, 5.0]], (64, 64))
     fragments = rasterize(vertices, torch.tensor([[0, 1, 2]]), views, 0.01)
     at = {int(p): i for i, p in enumerate(fragments.pixel)}
-    checked = 0
+    checked, (along_x, _) = 0, derivatives(fragments)
     for p, i in at.items():
         if p + 1 in at and p - 1 in at:
             j, k = at[p + 1], at[p - 1]
             difference = (fragments.barycentric[j] - fragments.barycentric[k]) / 2
-            torch.testing.assert_close(fragments.barycentric_dx[i], difference, atol=2e-4, rtol=0)
+            torch.testing.assert_close(along_x[i], difference, atol=2e-4, rtol=0)
             checked += 1
     assert checked > 100
 
@@ -251,13 +257,15 @@ def test_a_batch_of_cameras_equals_single_ones():
         part = batch.where(batch.view == n)
         single = rasterize(vertices, faces, one, 0.01)
         assert (part.pixel - n * SIZE[0] * SIZE[1]).tolist() == single.pixel.tolist()
-        for name in ("face", "barycentric", "barycentric_dx", "barycentric_dy", "depth", "front"):
+        for name in ("face", "barycentric", "depth", "front"):
             assert torch.equal(getattr(part, name), getattr(single, name)), name
+        assert all(map(torch.equal, derivatives(part), derivatives(single)))
 
 
 def assert_same(one, other):
-    for name in ("pixel", "view", "face", "barycentric", "barycentric_dx", "barycentric_dy", "depth", "front"):
+    for name in ("pixel", "view", "face", "barycentric", "depth", "front"):
         assert torch.equal(getattr(one, name), getattr(other, name)), name
+    assert all(map(torch.equal, derivatives(one), derivatives(other)))
 
 
 def test_a_run_is_repeated_to_the_bit_where_faces_coincide():

@@ -26,7 +26,7 @@ def linear_from_srgb(srgb: ArrayOrTensor) -> ArrayOrTensor:
     size = xp.abs(srgb)
     # the maximum keeps the unused branch of `where` from giving NaN gradients
     curved = ((_at_least(xp, size, 0.04045) + 0.055) / 1.055) ** 2.4
-    return xp.sign(srgb) * xp.where(size <= 0.04045, size / 12.92, curved)
+    return _sign(xp, srgb) * xp.where(size <= 0.04045, size / 12.92, curved)
 
 
 def srgb_from_linear(linear: ArrayOrTensor) -> ArrayOrTensor:
@@ -38,7 +38,7 @@ def srgb_from_linear(linear: ArrayOrTensor) -> ArrayOrTensor:
     curved -= 0.055
     if xp is np:  # the same bits, in two thirds of the time
         return xp.copysign(np.minimum(12.92 * size, curved), linear)
-    return xp.sign(linear) * xp.where(size <= 0.0031308, 12.92 * size, curved)
+    return _sign(xp, linear) * xp.where(size <= 0.0031308, 12.92 * size, curved)
 
 
 def lift_tone(codes, tone):
@@ -48,13 +48,8 @@ def lift_tone(codes, tone):
 
 
 def clamp_to_unit(values):
-    """Clip to [0, 1] with gradient 1 at 0 and 1. `torch.clamp` has gradient 0 there since 2.14, and a fully black or
-    white pixel could never change again.
-    """
-    xp = _library(values)
-    if xp is np or values.requires_grad:
-        return xp.where(values < 0, 0.0, xp.where(values > 1, 1.0, values))
-    return values.clamp(0, 1)
+    """Clip to [0, 1] with gradient 1 at 0 and 1: else a fully black or white pixel could never change again."""
+    return values.clip(0, 1)
 
 
 def codes_from_srgb(srgb):
@@ -126,6 +121,10 @@ def _hue(xp, b, a):
 def _library(array: Any) -> Any:
     """The array's library; torch is looked up and never imported, so that work on photographs needs no torch."""
     return sys.modules["torch"] if type(array).__module__.partition(".")[0] == "torch" else np
+
+
+def _sign(xp, array):
+    return xp.sign(array if xp is np else array.detach())  # torch would compute its gradient, which is 0
 
 
 def _at_least(xp, array, floor: float):

@@ -15,7 +15,6 @@ Blur, motion, noise and JPEG are given for the photograph's full size. A picture
 pixels, so they are multiplied by `scale`, and skipped where invisible. At full size the writer makes a real JPEG.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
@@ -160,25 +159,16 @@ def compress_jpeg(picture: Tensor, quality: Tensor) -> Tensor:
     return clamp_to_unit(jpeg_codec_differentiable(padded, quality)[..., :height, :width])
 
 
-@dataclass(frozen=True)
-class Lighting:
-    """The light of N views: `ambient` and `directional` N, and unit directions `toward` the light N×3."""
-
-    ambient: Tensor
-    directional: Tensor
-    toward: Tensor
-
-
-def lighting_of(light: Light, forward, up, device: torch.device | str = "cpu") -> Lighting:
-    """Return the light of N views on a patch whose printed side faces `forward`."""
+def lighting_of(light: Light, forward, up, device: torch.device | str = "cpu") -> Tensor:
+    """Return the light of N views on a patch whose printed side faces `forward`, 4×N: the ambient light, and the
+    directional light as a vector towards it.
+    """
     toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, forward, up)
-    values = np.column_stack([light.ambient, light.directional, toward]).astype(np.float32)  # sent to a device at once
-    ambient, directional, *direction = torch.as_tensor(values.T.copy(), device=device)
-    return Lighting(ambient, directional, torch.stack(direction, 1))
+    values = np.stack([light.ambient, *(light.directional * np.atleast_2d(toward).T)])  # sent to a device at once
+    return torch.as_tensor(values.astype(np.float32), device=device)
 
 
-def irradiance(normal: Tensor, view: Tensor, light: Lighting) -> Tensor:
-    """Return the light on P fragments with unit `normal` P×3, each in one of the views (`view` P)."""
-    # torch's own sum over three columns takes half as long again
-    cosine = geometry.dot(normal.unbind(-1), light.toward.index_select(0, view).unbind(-1)).clamp_min(0)
-    return light.ambient.index_select(0, view) + light.directional.index_select(0, view) * cosine
+def irradiance(normal: Tensor, light: Tensor) -> Tensor:
+    """Return the light P on fragments with unit `normal` 3×P, in the `light` 4×P of their views (`lighting_of`)."""
+    ambient, *directional = light
+    return geometry.dot(normal, directional).clamp_min_(0).add_(ambient)

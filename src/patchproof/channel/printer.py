@@ -145,7 +145,7 @@ def mottle_cells(seed: int) -> np.ndarray:
 
 def mottled(seen_srgb: Tensor, shift: Tensor) -> Tensor:
     """Return the sRGB colors `... × 3` with their mottle; bare paper stays 1, since only ink is uneven."""
-    return clamp_to_unit(seen_srgb + shift * ((1 - seen_srgb) / _MOTTLE_FADES).clamp(0, 1))
+    return clamp_to_unit(seen_srgb + shift * ((1 - seen_srgb) / _MOTTLE_FADES).clamp_max(1))
 
 
 def print_change(variation: Print) -> np.ndarray:
@@ -245,4 +245,4 @@ def _look_up(table: Tensor, srgb: Tensor) -> Tensor:
     grid = (2 * (position + 1) / (SIZE + 1) - 1).movedim(1, -1).flip(-1)  # grid_sample wants (x, y, z) = (b, g, r)
     sample, table = torch.nn.functional.grid_sample, _moved(table, colors.device, colors.dtype)
     values = sample(table, grid[None], mode="bilinear", padding_mode="border", align_corners=True)
-    return values[0].movedim(0, 1).to(srgb.dtype)
+    return values.squeeze(0).movedim(0, 1).to(srgb.dtype)

@@ -31,8 +31,9 @@ class Cameras:
 class Fragments:
     """P covered pixels and the faces they see. `pixel` is (view·H + y)·W + x, ascending; `view` and `face` are indices.
 
-    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `front` tells if the face shows its outside. The
-    derivatives of the barycentrics are computed on request from `rank` P (into Q) and `slopes` 6×Q.
+    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `front` tells if the face shows its outside. `rank` P
+    leads to the Q faces that views see, `seen` Q; `slopes` 2×3×Q are the changes per pixel, to the right and down, of
+    the second and the third barycentric and of 1, each over the depth, which are linear in a picture.
     """
 
     pixel: Tensor
@@ -41,6 +42,7 @@ class Fragments:
     depth: Tensor
     front: Tensor
     rank: Tensor
+    seen: Tensor
     slopes: Tensor
     shape: tuple[int, int, int]  # views, height, width
 
@@ -55,25 +57,27 @@ class Fragments:
     @cached_property
     def corner(self) -> Tensor:
         """P×3: the indices of the corners of each fragment's face in a list of all faces' corners."""
-        return torch.add(self.face[:, None] * 3, torch.arange(3, device=self.face.device))
+        out = torch.empty(len(self), 3, dtype=torch.int64, device=self.face.device)
+        torch.mul(self.face, 3, out=out[:, 0])  # by columns, as in `stack_columns`
+        for column in (1, 2):
+            torch.add(out[:, 0], column, out=out[:, column])
+        return out
 
-    @cached_property
-    def barycentric_dx(self) -> Tensor:
-        """P×3 float32: change of the barycentrics per pixel to the right."""
-        return self._derivative(0)
-
-    @cached_property
-    def barycentric_dy(self) -> Tensor:
-        """P×3 float32: change of the barycentrics per pixel down."""
-        return self._derivative(1)
-
-    def _derivative(self, axis: int) -> Tensor:
-        # d(e_i / t) = (de_i - e_i/t · dt) / t
-        first, second, total = (self.slopes[2 * i + axis].index_select(0, self.rank) for i in range(3))
-        b, z = self.barycentric, self.depth
-        first.addcmul_(b[:, 1], total, value=-1).mul_(z)
-        second.addcmul_(b[:, 2], total, value=-1).mul_(z)
-        return stack_columns(-(first + second), first, second)
+    def derivatives(self, corner_values: Tensor, values: Tensor) -> list[Tensor]:
+        """Return how values P×C change per pixel to the right and down, each P×C float32 (by columns in memory), if
+        they are interpolated between `corner_values` F×3×C.
+        """
+        # v / z is linear in the picture, and so is 1 / z: v' = z ((v / z)' - v (1 / z)'). No fused operations: how they
+        # round depends on a number's place in memory
+        first, *others = corner_values.index_select(0, self.seen).unbind(1)
+        derivatives = []
+        for *slopes, total in self.slopes:
+            plane = first.T * total
+            for corner, slope in zip(others, slopes, strict=True):
+                plane += (corner - first).T * slope
+            at_fragments, total = plane.index_select(1, self.rank), total.index_select(0, self.rank)
+            derivatives.append(at_fragments.sub_(values.T * total).mul_(self.depth).T)
+        return derivatives
 
     def where(self, keep: Tensor) -> "Fragments":
         """Return the fragments for which `keep` (P, bool) is true."""

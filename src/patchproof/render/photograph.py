@@ -145,14 +145,11 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
 def _mottle(views: Views, picture: PiecePicture) -> Tensor:
     """Return what each print's mottle adds to the piece's pixels, P×3 in sRGB."""
     piece, variation = views.on_piece, views.conditions.print
-    cell, first = _cell_of_texel(picture.size_px, piece.view.device), (piece.view[:, None] * MOTTLE_CELLS**2).int()
-    groups = []
-    for group in piece.texels.groups:
-        texel = cell.index_select(0, group.texel.flatten()).view_as(group.texel)
-        groups.append(replace(group, texel=texel.add_(first if group.fragment is None else first[group.fragment])))
+    cell = _cell_of_texel(picture.size_px, piece.view.device).index_select(0, piece.texels.texel)
+    first = (piece.view * MOTTLE_CELLS**2).int().index_select(0, piece.texels.fragment)
     prints = zip(variation.mottle, variation.mottle_seed, strict=True)
     cells = np.concatenate([rms * mottle_cells(int(seed)) for rms, seed in prints])
-    return look_up(replace(piece.texels, groups=tuple(groups)), torch.as_tensor(cells).to(picture.codes))
+    return look_up(replace(piece.texels, texel=cell.add_(first)), torch.as_tensor(cells).to(picture.codes))
 
 
 @lru_cache(maxsize=4)

@@ -52,16 +52,17 @@ def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float)
         _write_keys(keys, homogeneous(vertices, cameras[view : view + views_at_once]), faces, cameras.size_px, near_mm)
     fragments = _allocate(nearest, shape)
     del nearest
-    slopes = [fragments.slopes]
+    seen, slopes = [fragments.seen], [fragments.slopes]
     for view in groups:
         points = homogeneous(vertices, cameras[view : view + views_at_once])
         ends = fragments.pixel.new_tensor([view, view + views_at_once]) * (height * width)
         first, last = torch.searchsorted(fragments.pixel, ends).tolist()
         for start in range(first, last, CHUNK):
             part = slice(start, min(start + CHUNK, last))
-            slopes.append(_resolve(fragments, part, points, faces, view, near_mm))
-            fragments.rank[part] += sum(s.shape[1] for s in slopes[:-1])
-    return replace(fragments, slopes=torch.cat(slopes, 1))
+            fragments.rank[part] = sum(map(len, seen))
+            for found, one in zip((seen, slopes), _resolve(fragments, part, points, faces, view, near_mm), strict=True):
+                found.append(one)
+    return replace(fragments, seen=torch.cat(seen), slopes=torch.cat(slopes, 2))
 
 
 def homogeneous(vertices: Tensor, cameras: Cameras) -> Tensor:
@@ -225,12 +226,14 @@ def _allocate(nearest: Tensor, shape: tuple[int, int, int]) -> Fragments:
     pixel = nearest.nonzero()[:, 0]
     face = nearest.index_select(0, pixel).bitwise_and_(_FACE_MASK).neg_().add_(_FACE_MASK)
     depth, front = (torch.empty_like(pixel, dtype=dtype) for dtype in (torch.float32, torch.bool))
-    barycentric, rank, slopes = depth.new_empty(len(pixel), 3), torch.empty_like(pixel), depth.new_empty(6, 0)
-    return Fragments(pixel, face, barycentric, depth, front, rank, slopes, shape)
+    barycentric, rank, seen = depth.new_empty(len(pixel), 3), torch.empty_like(pixel), pixel[:0]
+    return Fragments(pixel, face, barycentric, depth, front, rank, seen, depth.new_empty(2, 3, 0), shape)
 
 
-def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, view0: int, near: float) -> Tensor:
-    """Fill in one part of the fragments, all within the views of `points`; return the slopes of the faces seen."""
+def _resolve(
+    fragments: Fragments, part: slice, points: Tensor, faces: Tensor, view0: int, near: float
+) -> tuple[Tensor, Tensor]:
+    """Fill in one part of the fragments, all within the views of `points`; return the faces seen and their slopes."""
     _, height, width = fragments.shape
     position = fragments.pixel[part].double()
     row = (position / width).floor_()
@@ -248,8 +251,9 @@ def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, v
     fragments.barycentric[part] = stack_columns(1 - second - third, second, third)
     fragments.depth[part] = z
     fragments.front[part] = (volume < 0).index_select(0, rank)
-    fragments.rank[part] = rank
-    return torch.stack([t for plane in planes for t in plane[:2]]).float()
+    fragments.rank[part] += rank
+    slopes = torch.stack([plane[axis] for axis in range(2) for plane in planes]).float()
+    return owner % len(faces), slopes.view(2, 3, -1)
 
 
 def rank_values(values: Tensor, limit: int) -> tuple[Tensor, Tensor]:

@@ -52,7 +52,7 @@ class PrintedPiece:
 
     def _printed(self, srgb: Tensor) -> Tensor:
         """Print 3×H×W as sent; return H×W×3 as it looks on paper."""
-        return self.printer.apply(srgb[None])[0].permute(1, 2, 0)
+        return self.printer.apply(srgb[None]).squeeze(0).permute(1, 2, 0)
 
 
 @dataclass(frozen=True, eq=False)

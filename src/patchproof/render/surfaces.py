@@ -23,9 +23,7 @@ from patchproof.mesh.surface_chart import grid_faces
 from patchproof.render.outlines import Edges, find_edges
 from patchproof.render.texture import (
     TexelLayout,
-    footprint,
     group_by_grid,
-    look_up,
     mip_levels,
     tap_grids,
     tap_offsets,
@@ -187,10 +185,10 @@ def sample_atlas(
 ) -> Tensor:
     """Return the P×3 that fragments see in an atlas; arguments as in `texture.footprint`, `taps` at most MAX_TAPS."""
     assert layout.pitch is not None and taps <= MAX_TAPS
-    if taps == 1:
-        return look_up(footprint(layout, texture, uv, uv_dx, uv_dy, taps), texels)
     picture = texels.view(1, -1, layout.pitch, 3).permute(0, 3, 1, 2)
     places, counts = _place_grids(layout, picture.shape[2], texture, uv, uv_dx, uv_dy, taps)
+    if counts is None:
+        return F.grid_sample(picture, torch.stack(places, 1)[None, None], align_corners=False)[0, :, 0].T
     order, grids = group_by_grid(*counts)
     places = torch.stack([values.index_select(0, order) for values in places]).view(3, 2, 1, 1, -1)
     colors = texels.new_empty(len(order), 3)
@@ -206,25 +204,26 @@ def sample_atlas(
 
 def _place_grids(
     layout: TexelLayout, height: int, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int
-) -> tuple[list[Tensor], tuple[Tensor, Tensor]]:
+) -> tuple[list[Tensor], tuple[Tensor, Tensor] | None]:
     """Return each of P grids' middle (x, y) and steps (x, y) to the right and down between its taps, in half widths and
-    heights of the picture from its middle, which the look-up takes; and the numbers of taps across and down.
+    heights of the picture from its middle, which the look-up takes; and the numbers of taps across and down. Of single
+    taps the middle alone, and None.
     """
     assert layout.pitch is not None
     *sizes, first = layout.places.T.contiguous()
-    corners, picture_px = (first % layout.pitch, first // layout.pitch), (layout.pitch, height)
     finest, levels = texture * (len(first) // len(layout.levels)), layout.levels.index_select(0, texture)
-    sides = [(right.contiguous(), down.contiguous()) for right, down in zip(uv_dx.T, uv_dy.T, strict=True)]
+    sides = list(zip(uv_dx.T, uv_dy.T, strict=True))
     extents = (size.float().index_select(0, finest) for size in sizes)
     x, y = ([side * extent for side in pair] for pair, extent in zip(sides, extents, strict=True))
-    across, down = ((a * a + b * b).sqrt() for a, b in zip(x, y, strict=True))
+    across, down = ((a * a).add_(b * b).sqrt_() for a, b in zip(x, y, strict=True))
     level, counts = tap_grids(across, down, levels, taps)
-    assert counts is not None
-    middles, steps = [], []
-    for axis in range(2):
-        size, corner = (table[axis].float().index_select(0, finest + level) for table in (sizes, corners))
-        position = uv[:, axis] * size - 0.5
-        middles.append((position - (position / size).floor() * size + corner + 0.5) * (2 / picture_px[axis]) - 1)
-        per_texel = (size * (2 / picture_px[axis])).masked_fill(size == 1, 0)  # one texel: one color everywhere
-        steps.append([side * per_texel / count for side, count in zip(sides[axis], counts, strict=True)])
+    middles, steps, place = [], [], finest + level
+    corners = (first % layout.pitch) * (2 / layout.pitch) - 1, (first // layout.pitch) * (2 / height) - 1
+    for axis, side_px in enumerate((layout.pitch, height)):
+        size, corner = (table[axis].index_select(0, place) for table in (sizes, corners))
+        extent = size * (2 / side_px)
+        middles.append((uv[:, axis] - uv[:, axis].floor()).mul_(extent).add_(corner))
+        if counts is not None:
+            extent = extent.masked_fill(size == 1, 0)  # one texel: one color everywhere
+            steps.append([side * extent / count for side, count in zip(sides[axis], counts, strict=True)])
     return [*middles, *chain.from_iterable(zip(*steps, strict=True))], counts

@@ -12,7 +12,7 @@ from 16×16 samples per pixel, this grid 33 to 57. Left out on purpose: filters 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import chain
 
 import torch
@@ -42,32 +42,31 @@ class TexelLayout:
 
 
 @dataclass(frozen=True)
-class TapGroup:
-    """G fragments with as many taps each: the `texel` and `weight` G×J that they see."""
+class Footprint:
+    """The texels that P fragments see: L texels with their weights, those of fragment i from `first[i]` to before
+    `first[i + 1]`.
+    """
 
-    fragment: Tensor | None  # None: all of them, in order
     texel: Tensor
     weight: Tensor
-
-
-@dataclass(frozen=True)
-class Footprint:
-    """The texels that P fragments see, with weights."""
-
-    groups: tuple[TapGroup, ...]
-    fragments: int
+    first: Tensor
 
     def part(self, first: int, last: int) -> "Footprint":
-        """Return the footprint of the fragments from `first` up to `last`."""
-        groups = []
-        for group in self.groups:
-            if group.fragment is None:
-                groups.append(TapGroup(None, group.texel[first:last], group.weight[first:last]))
-                continue
-            low, high = torch.searchsorted(group.fragment, group.fragment.new_tensor([first, last])).tolist()
-            if low < high:
-                groups.append(TapGroup(group.fragment[low:high] - first, group.texel[low:high], group.weight[low:high]))
-        return Footprint(tuple(groups), last - first)
+        """Return the footprint of the fragments from `first` to before `last`."""
+        low, high = torch.stack([self.first[first], self.first[last]]).tolist()
+        return Footprint(self.texel[low:high], self.weight[low:high], self.first[first : last + 1] - low)
+
+    @cached_property
+    def fragment(self) -> Tensor:
+        """L: the fragment that sees each texel."""
+        return torch.repeat_interleave(self.first.diff(), output_size=len(self.texel)).int()
+
+    @cached_property
+    def seen_by(self) -> "Footprint":
+        """The same the other way round: the fragments, with their weights, that see each texel up to the last seen."""
+        first = F.pad(torch.bincount(self.texel).cumsum(0, dtype=torch.int), (1, 0))
+        order = self.texel.argsort(stable=True)
+        return Footprint(self.fragment.index_select(0, order), self.weight.index_select(0, order), first)
 
 
 def texel_layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device | str = "cpu") -> TexelLayout:
@@ -88,11 +87,9 @@ def texel_layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device 
 
 def texel_table(textures: list[Tensor], wrap: bool) -> Tensor:
     """Return the T×3 texels of all mip levels of H×W×3 textures, in the order of `texel_layout`; differentiable."""
-    parts, edge = [], 0 if wrap else -1
-    for level in chain.from_iterable(map(mip_levels, textures)):
-        padded = torch.cat([level, level[:, edge, None]], 1)
-        parts.append(torch.cat([padded, padded[edge, None]]).flatten(0, 1))
-    return torch.cat(parts)
+    mode, levels = "circular" if wrap else "replicate", chain.from_iterable(map(mip_levels, textures))
+    padded = (F.pad(level.permute(2, 0, 1)[None], (0, 1, 0, 1), mode) for level in levels)
+    return torch.cat([level.flatten(2) for level in padded], 2).squeeze(0).T.contiguous()
 
 
 def mip_levels(texture: Tensor) -> Iterator[Tensor]:
@@ -107,7 +104,9 @@ def _half_size(level: Tensor) -> Tensor:
     """Return H×W×3 with half the rows and columns."""
     if level.shape[0] % 2 or level.shape[1] % 2:
         return _half_rows(_half_rows(level).transpose(0, 1)).transpose(0, 1)
-    return F.avg_pool2d(level.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)  # the same, with a tenth of the operations
+    return (
+        F.avg_pool2d(level.permute(2, 0, 1)[None], 2).squeeze(0).permute(1, 2, 0)
+    )  # the same, with a tenth of the operations
 
 
 def _half_rows(level: Tensor) -> Tensor:
@@ -132,20 +131,30 @@ def footprint(
     pixel. There are at most `taps` along its shorter side and twice as many along the longer one; with `taps` = 1 there
     is one. Texels are points to interpolate between, or `blocks` of one color, like printed pixels.
     """
+    uv, uv_dx, uv_dy = (values.contiguous() for values in (uv, uv_dx, uv_dy))
     size, _ = layout.place(texture, 0)
     spans = _length(uv_dx * size), _length(uv_dy * size)
     level, counts = tap_grids(*spans, layout.levels.index_select(0, texture), taps)
     size, offset = layout.place(texture, level)
     tap_arguments = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
     if counts is None:
-        return Footprint((TapGroup(None, *_taps(*tap_arguments, 1, 1, layout, blocks)),), len(uv))
-    order, grids = group_by_grid(*counts)
-    groups = []
-    for columns, rows, first, last in grids:
-        fragment = order[first:last]
+        texel, weight = _taps(*tap_arguments, 1, 1, layout, blocks)
+        first = torch.arange(0, texel.numel() + 1, 4, dtype=torch.int, device=texel.device)
+        return Footprint(texel.flatten(), weight.flatten(), first)
+    columns, rows = counts
+    count = columns.int() * rows * 4
+    first = F.pad(count.cumsum(0, dtype=torch.int), (1, 0))
+    texel = torch.empty(int(first[-1]), dtype=torch.int, device=uv.device)
+    weight = texel.new_empty(texel.shape, dtype=torch.float32)
+    order, grids = group_by_grid(columns, rows)
+    for columns, rows, begin, end in grids:
+        fragment = order[begin:end]
         center, dx, dy, level_size, corner = (values.index_select(0, fragment) for values in tap_arguments)
-        groups.append(TapGroup(fragment, *_taps(center, dx, dy, level_size, corner, columns, rows, layout, blocks)))
-    return Footprint(tuple(groups), len(uv))
+        taps = _taps(center, dx, dy, level_size, corner, columns, rows, layout, blocks)
+        place = first.index_select(0, fragment)[:, None] + torch.arange(4 * columns * rows, device=uv.device)
+        for table, values in zip((texel, weight), taps, strict=True):
+            table.scatter_(0, place.flatten(), values.flatten())  # in a quarter of the time of an index
+    return Footprint(texel, weight, first)
 
 
 def tap_grids(across: Tensor, down: Tensor, levels: Tensor, taps: int) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
@@ -241,27 +250,19 @@ def look_up(footprint: Footprint, texels: Tensor) -> Tensor:
 
 
 class _LookUp(torch.autograd.Function):
-    """A weighted gather. Its backward adds channel by channel: torch's took six times as long (2 cores, 45k × 64)."""
+    """A weighted gather. Its backward gathers, too, by texels: adding to them took three times as long."""
 
     @staticmethod
     def forward(ctx, texels: Tensor, footprint: Footprint) -> Tensor:
         ctx.footprint, ctx.texels = footprint, len(texels)
-        out = texels.new_zeros(footprint.fragments, 3)
-        for group in footprint.groups:
-            weight = group.weight.to(texels.dtype)
-            sums = F.embedding_bag(group.texel, texels, per_sample_weights=weight, mode="sum")
-            if group.fragment is None:
-                return sums
-            out[group.fragment] = sums
-        return out
+        return _weighted_sums(texels, footprint)
 
     @staticmethod
     def backward(ctx, *gradients: Tensor):
-        (gradient,) = gradients
-        out = gradient.new_zeros(3, ctx.texels)
-        for group in ctx.footprint.groups:
-            weight, texel = group.weight.to(gradient.dtype), group.texel.flatten().long()
-            of_group = gradient if group.fragment is None else gradient[group.fragment]
-            for channel, part in zip(out, of_group.unbind(1), strict=True):
-                channel.scatter_add_(0, texel, (weight * part[:, None]).flatten())
-        return out.T, None
+        seen = _weighted_sums(gradients[0].contiguous(), ctx.footprint.seen_by)
+        return F.pad(seen, (0, 0, 0, ctx.texels - len(seen))), None
+
+
+def _weighted_sums(table: Tensor, footprint: Footprint) -> Tensor:
+    rows, weight, first = footprint.texel, footprint.weight.to(table.dtype), footprint.first
+    return F.embedding_bag(rows, table, first, per_sample_weights=weight, mode="sum", include_last_offset=True)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from patchproof.base.color import LINEAR_FROM_CODE, lift_tone
 from patchproof.base.geometry import Frame, camera_centers
-from patchproof.channel.camera import Lighting, encode_light, encode_light_by_table, gains, irradiance, lighting_of
+from patchproof.channel.camera import encode_light, encode_light_by_table, gains, irradiance, lighting_of
 from patchproof.render import pixels
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, find_outlines
@@ -44,7 +44,7 @@ class Views:
     conditions: Conditions
     size_px: tuple[int, int]
     frame_px: tuple[int, int]
-    light: Lighting | None  # None for pictures, which bring their own
+    light: Tensor | None  # 4×N (`lighting_of`); None for pictures, which bring their own
     background: np.ndarray  # uint8 N×H×W×3 sRGB
     object: ObjectPixels | None
     piece: PiecePixels | None
@@ -81,21 +81,21 @@ class Views:
 
     def object_light(self, texels: Tensor | None = None) -> Tensor:
         """The bare object's light, differentiable; other `texels` need views that were rendered for textures."""
-        return self._behind.index_copy(0, self.on_object.pixel, self._object_color(texels))
+        return self._behind.index_copy(0, self.on_object.pixel, self._object_color(texels).T)
 
     def _object_color(self, texels: Tensor | None = None) -> Tensor:
-        """Return the light P×3 of the object's fragments."""
+        """Return the light 3×P of the object's fragments."""
         visible, reflected = self.on_object, self.on_object.color
         if visible.texels is not None:
             table = self.stage.object_surface.texels(self.reduced, fixed=False) if texels is None else texels
-            reflected = look_up(visible.texels, table) * reflected
-        return reflected * self._irradiance(visible)
+            reflected = look_up(visible.texels, table).T * reflected
+        return reflected * irradiance(visible.normal, visible.spread(self._light))
 
-    def _irradiance(self, lit: ObjectPixels | PiecePixels) -> Tensor:
-        """Return the light P×1 that falls on pixels."""
+    @property
+    def _light(self) -> Tensor:
         if self.light is None:
             raise ValueError("pictures bring their own light")
-        return irradiance(lit.normal, lit.view, self.light)[:, None]
+        return self.light
 
     @cached_property
     def _behind(self) -> Tensor:
@@ -112,9 +112,9 @@ class Views:
         image = _look_up_codes(self.background, codes.numpy(), self.stage.device)
         if self.object is None:
             return image
-        gain, tone = self._sensor_on_device.index_select(0, self.object.view).split(3, 1)
+        gain, tone = self.object.spread(self._sensor_on_device.T).split(3)
         color = encode_light_by_table(self._object_color() * gain)
-        return image.index_copy_(0, self.object.pixel, lift_tone(color, tone))
+        return image.index_copy_(0, self.object.pixel, lift_tone(color, tone).T)
 
     def encode(self, light: Tensor, view: Tensor) -> Tensor:
         """Return the code values P×3 of light at pixels of the views P, in a camera without blur and noise."""
@@ -134,8 +134,10 @@ class Views:
     @cached_property
     def piece_white(self) -> Tensor:
         """The light on white paper at the piece's pixels, P×3 or P×1."""
-        white = self.on_piece.white
-        return self._irradiance(self.on_piece) if white is None else white
+        piece = self.on_piece
+        if piece.white is not None:
+            return piece.white
+        return irradiance(piece.normal, self._light.index_select(1, piece.view))[:, None]
 
 
 def render_views(
@@ -160,7 +162,7 @@ def render_views(
     view_cameras = cameras(poses, matrices, frame.size_px, stage)
     fragments = rasterize(surface.vertices, surface.faces, view_cameras, near)
     nearest = torch.full((math.prod(fragments.shape),), torch.inf, device=stage.device)
-    nearest[fragments.pixel] = fragments.depth
+    nearest.scatter_(0, fragments.pixel, fragments.depth)
     look, piece_parts = replace(look, taps=pixels.PHOTO_SAMPLING.taps) if scene.LEARNS_TEXTURE else look, None
     if piece is not None:
         print_cameras = cameras(poses @ scene.printed_from_sheet(conditions), matrices, frame.size_px, stage)

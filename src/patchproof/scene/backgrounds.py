@@ -225,7 +225,7 @@ class Backgrounds:
         matrix = index_homography(np.array([[scale_x, 0, x0 * sx], [0, scale_y, y0 * sy], [0, 0, 1.0]]))
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         picture = cv2.warpAffine(shrunk, matrix[:2], size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        return picture[:, ::-1] if choice[4] < 0.5 else picture
+        return cv2.flip(picture, 1) if choice[4] < 0.5 else picture
 
 
 def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
