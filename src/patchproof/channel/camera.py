@@ -171,4 +171,4 @@ def lighting_of(light: Light, forward, up, device: torch.device | str = "cpu") -
 def irradiance(normal: Tensor, light: Tensor) -> Tensor:
     """Return the light P on fragments with unit `normal` 3×P, in the `light` 4×P of their views (`lighting_of`)."""
     ambient, *directional = light
-    return geometry.dot(normal, directional).clamp_min_(0).add_(ambient)
+    return geometry.dot(normal.unbind(), directional).clamp_min_(0).add_(ambient)

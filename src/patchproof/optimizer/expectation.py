@@ -33,7 +33,7 @@ VIEWS_AHEAD = 8  # views of the next steps that a process renders together; two 
 # was 0.7 % [-0.2, 1.5] higher than with one pose for each view, and as many views were recognized. With one background
 # for each pose, too, it was 2 % higher; with one pose for four steps in a row, 25 to 33 %.
 MIN_POSES, VIEWS_PER_POSE = 240, 4
-CACHE_PX = 480 * 224**2  # of the views that all processes keep, at 20 to 60 bytes a pixel
+CACHE_PX = 480 * 224**2  # of the views that all processes keep, at 20 to 70 bytes a pixel
 SELECT_CHUNK = 4  # selection views that a process renders together
 
 

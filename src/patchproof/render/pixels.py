@@ -5,6 +5,7 @@ positions if light needs them. The piece's edge is antialiased in its own millim
 along each of the piece's sides, that lies within the cut line.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -182,11 +183,10 @@ def object_pixels(
         texels = footprint(surface.layout, *query)
     else:
         color = sample_atlas(surface.atlas, fixed, *query).T * color
-    length = dot(normal, normal).sqrt_().clamp_min_(1e-12)
+    length = dot(*[normal.unbind()] * 2).sqrt_().clamp_min_(1e-12)
     length = torch.where(fragments.front, length, -length)
     normal = torch.div(normal, length, out=torch.empty_like(normal, memory_format=torch.contiguous_format))
-    views, height, width = fragments.shape
-    starts = torch.arange(views + 1, device=material.device) * (height * width)
+    starts = torch.arange(fragments.shape[0] + 1, device=material.device) * math.prod(fragments.shape[1:])
     counts = torch.searchsorted(fragments.pixel, starts).diff().tolist()
     return ObjectPixels(fragments.pixel, tuple(counts), texels, color.contiguous(), normal)
 

@@ -150,9 +150,9 @@ def footprint(
     for columns, rows, begin, end in grids:
         fragment = order[begin:end]
         center, dx, dy, level_size, corner = (values.index_select(0, fragment) for values in tap_arguments)
-        taps = _taps(center, dx, dy, level_size, corner, columns, rows, layout, blocks)
+        seen = _taps(center, dx, dy, level_size, corner, columns, rows, layout, blocks)
         place = first.index_select(0, fragment)[:, None] + torch.arange(4 * columns * rows, device=uv.device)
-        for table, values in zip((texel, weight), taps, strict=True):
+        for table, values in zip((texel, weight), seen, strict=True):
             table.scatter_(0, place.flatten(), values.flatten())  # in a quarter of the time of an index
     return Footprint(texel, weight, first)
 
@@ -223,8 +223,7 @@ def _taps(
         per_cell = 1 / (step_x * step_x + step_y * step_y).sqrt().clamp(1e-6, 1)[:, :, None, None]
         share = torch.addcmul(0.5 - 0.5 * per_cell, share, per_cell).clamp_(0, 1)
     x, y = share.unbind(1)
-    width, pitch = size[:, 0], layout.pitch
-    stride = width.int() + 1 if pitch is None else torch.full_like(width, pitch, dtype=torch.int)
+    stride = size[:, 0].int() + 1
     texel = torch.empty(len(center), 4, rows, columns, dtype=torch.int, device=center.device)
     low = low.int()
     first = torch.add(low[:, 1] * stride, low[:, 0] + offset[:, None, None].int(), out=texel[:, 0])

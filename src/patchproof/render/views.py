@@ -134,10 +134,8 @@ class Views:
     @cached_property
     def piece_white(self) -> Tensor:
         """The light on white paper at the piece's pixels, P×3 or P×1."""
-        piece = self.on_piece
-        if piece.white is not None:
-            return piece.white
-        return irradiance(piece.normal, self._light.index_select(1, piece.view))[:, None]
+        piece, white = self.on_piece, self.on_piece.white
+        return irradiance(piece.normal, self._light.index_select(1, piece.view))[:, None] if white is None else white
 
 
 def render_views(

@@ -3,9 +3,9 @@
 In: `suv.toml` and `effects.toml`, the same with every effect on. Out: `step.csv`, in milliseconds: a step of four
 views, selections apart, where poses are seen for the first time and where they come round again, both as often as in a
 run of default length (a quarter and three), and the network's forward and backward pass of four such pictures in the
-same rounds; so many processes share the views, so many threads the pass. Means of all steps, as a process sees the
-views of several steps in one of them; of passes the medians of each round. Freed memory is kept as the command line
-keeps it, by the pass, too. Run in this folder, idle: python step.py
+same rounds; so many processes share the views, so many threads the pass. Means of each round's medians; of steps with
+new poses means, as a process sees the views of several in one of them. Freed memory is kept as the command line keeps
+it, by the pass, too. Run in this folder, idle: python step.py
 """
 
 import statistics
@@ -87,14 +87,14 @@ def measured(name: str, scene: str, processes: int) -> dict:
         torch.set_num_threads(1)
         timed = [time_call(partial(next, running), perf_counter) for _ in range(STEPS)]
         selects = [loop.ends_interval(asked.optimize, step.state.number, loop.SELECT_AFTER) for step, _ in timed]
-        return statistics.mean(ms for (_, ms), select in zip(timed, selects, strict=True) if not select)
+        middle = statistics.mean if timed[0][0].state.number <= NEW * STEPS else statistics.median
+        return middle(ms for (_, ms), select in zip(timed, selects, strict=True) if not select)
 
     rounds = call_in_turn({"pass": passes, "step": steps}, ROUNDS - 1)
     running.close()
     parts = {name: (statistics.mean(ms[: NEW - 1]), statistics.mean(ms[NEW - 1 :])) for name, ms in rounds.items()}
     own_ms, step_ms = ((new + 3 * again) / 4 for new, again in parts.values())
-    new_ms, again_ms = parts["step"]
-    times = {"new_ms": new_ms, "again_ms": again_ms, "step_ms": step_ms, "pass_ms": own_ms}
+    times = dict(zip(("new_ms", "again_ms"), parts["step"], strict=True)) | {"step_ms": step_ms, "pass_ms": own_ms}
     return {name: round(value, 1) for name, value in times.items()} | {"ratio": round(step_ms / own_ms, 3)}
 
 
