@@ -314,6 +314,18 @@ def test_a_lens_puts_the_markers_where_opencv_says(tmp_path, k1):
     assert moved > (0.5 if k1 is None else 4)
 
 
+def test_a_face_seen_from_behind_is_lit_on_the_side_that_is_seen(tmp_path):
+    """A sheet of paper beside a cube, whose outside looks away from the camera."""
+    corners = [[200.0, -150, 0], [600, -150, 0], [600, 150, 0], [200, 150, 0]]
+    sheet = trimesh.Trimesh(corners, [[0, 2, 1], [0, 3, 2]])
+    trimesh.util.concatenate([trimesh.creation.box((300, 300, 300)), sheet]).export(tmp_path / "both.ply")
+    scene = scene_of(tmp_path, ("primitive:carton", "both.ply"), ("_mm = 90", "_mm = 60"))
+    views = render_views(set_stage(scene), None, posed(scene), (96, 96))
+    column, (*_, toward) = views.object.pixel % 96, views.object.normal
+    assert len(toward[column > 48]) > 300 and bool((toward[column > 48] > 0.9).all()), "the sheet"
+    assert bool((toward > -0.1).all())
+
+
 def test_a_camera_inside_the_object_is_refused_in_one_sentence(tmp_path):
     scene = box_scene(tmp_path)
     with pytest.raises(

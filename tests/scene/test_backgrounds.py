@@ -219,3 +219,9 @@ def test_pixels_have_their_nearest_point_whether_it_was_asked_for_or_not(count, 
     points = np.random.default_rng(count).random((count, 2)) * px
     far = np.linalg.norm(np.argwhere(np.ones((px, px)))[:, None] - points, axis=2)
     assert np.array_equal(patterns._nearest(points, px).ravel(), far.argmin(1))
+
+
+def test_half_of_the_views_are_mirrored_left_to_right():
+    backgrounds, choice = load_backgrounds(BackgroundSettings(), None), [0.3, 0.5, 0.5, 0.5]
+    plain, mirrored = (backgrounds.picture(np.array([*choice, side]), (640, 480), (64, 64)) for side in (0.7, 0.3))
+    assert np.array_equal(plain[:, ::-1], mirrored) and not np.array_equal(plain, mirrored)

@@ -153,7 +153,7 @@ def footprint(
         seen = _taps(center, dx, dy, level_size, corner, columns, rows, layout, blocks)
         place = first.index_select(0, fragment)[:, None] + torch.arange(4 * columns * rows, device=uv.device)
         for table, values in zip((texel, weight), seen, strict=True):
-            table.scatter_(0, place.flatten(), values.flatten())  # in a quarter of the time of an index
+            table.scatter_(0, place.flatten(), values.flatten())  # a quarter of an index's time
     return Footprint(texel, weight, first)
 
 
