@@ -48,7 +48,9 @@ def lift_tone(codes, tone):
 
 
 def clamp_to_unit(values):
-    """Clip to [0, 1] with gradient 1 at 0 and 1: else a fully black or white pixel could never change again."""
+    """Clip to [0, 1] with gradient 1 at 0 and 1, else a fully black or white pixel could never change again; torch's
+    own has gradient 0 there since 2.14, which is why older releases are required.
+    """
     return values.clip(0, 1)
 
 

@@ -164,7 +164,7 @@ def lighting_of(light: Light, forward, up, device: torch.device | str = "cpu") -
     directional light as a vector towards it.
     """
     toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, forward, up)
-    values = np.stack([light.ambient, *(light.directional * np.atleast_2d(toward).T)])  # sent to a device at once
+    values = np.stack([light.ambient, *(light.directional * toward.T)])  # sent to a device at once
     return torch.as_tensor(values.astype(np.float32), device=device)
 
 

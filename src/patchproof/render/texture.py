@@ -104,9 +104,8 @@ def _half_size(level: Tensor) -> Tensor:
     """Return H×W×3 with half the rows and columns."""
     if level.shape[0] % 2 or level.shape[1] % 2:
         return _half_rows(_half_rows(level).transpose(0, 1)).transpose(0, 1)
-    return (
-        F.avg_pool2d(level.permute(2, 0, 1)[None], 2).squeeze(0).permute(1, 2, 0)
-    )  # the same, with a tenth of the operations
+    # the same, with a tenth of the operations
+    return F.avg_pool2d(level.permute(2, 0, 1)[None], 2).squeeze(0).permute(1, 2, 0)
 
 
 def _half_rows(level: Tensor) -> Tensor:
@@ -141,12 +140,10 @@ def footprint(
         texel, weight = _taps(*tap_arguments, 1, 1, layout, blocks)
         first = torch.arange(0, texel.numel() + 1, 4, dtype=torch.int, device=texel.device)
         return Footprint(texel.flatten(), weight.flatten(), first)
-    columns, rows = counts
-    count = columns.int() * rows * 4
-    first = F.pad(count.cumsum(0, dtype=torch.int), (1, 0))
+    first = F.pad((4 * counts[0].int() * counts[1]).cumsum(0, dtype=torch.int), (1, 0))
     texel = torch.empty(int(first[-1]), dtype=torch.int, device=uv.device)
     weight = texel.new_empty(texel.shape, dtype=torch.float32)
-    order, grids = group_by_grid(columns, rows)
+    order, grids = group_by_grid(*counts)
     for columns, rows, begin, end in grids:
         fragment = order[begin:end]
         center, dx, dy, level_size, corner = (values.index_select(0, fragment) for values in tap_arguments)
