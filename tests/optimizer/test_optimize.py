@@ -444,6 +444,7 @@ def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
     problem = set_problem(scene_with(tmp_path))
     monkeypatch.setattr(expectation, "MIN_POSES", 24)
     monkeypatch.setattr(expectation, "CACHE_PX", 5 * 2 * problem.training_px**2)
+    monkeypatch.setattr(expectation, "AHEAD_PX", 9 * problem.training_px**2)
     drawn, seen = problem.scene.draw("train", 24), []
     monkeypatch.setattr(
         expectation,
@@ -453,7 +454,7 @@ def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
     cache = expectation.ViewCache(problem, drawn)
     for first in (0, 4, 8, 12, 16, 20, 0, 4, 8, 12, 16, 20):
         cache.views(first, drawn[first : first + 2])
-    assert seen == [expectation.VIEWS_AHEAD, 4, 2], "the last pair is seen twice"
+    assert seen == [8, 4, 2], "the last pair is seen twice"
     assert not cache._ahead, "what is not kept is seen once"
 
 

@@ -9,7 +9,7 @@ time in views and three quarters in photographs.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial, reduce
+from functools import cached_property, lru_cache, partial, reduce
 from itertools import chain
 
 import numpy as np
@@ -21,15 +21,7 @@ from patchproof.base.color import linear_from_srgb
 from patchproof.mesh.mesh import Mesh
 from patchproof.mesh.surface_chart import grid_faces
 from patchproof.render.outlines import Edges, find_edges
-from patchproof.render.texture import (
-    TexelLayout,
-    group_by_grid,
-    mip_levels,
-    tap_grids,
-    tap_offsets,
-    texel_layout,
-    texel_table,
-)
+from patchproof.render.texture import TexelLayout, mip_levels, tap_grids, texel_layout, texel_table
 from patchproof.scene.interface import PieceScene
 
 # Share of the piece's sides: the half pixel that is needed, for pieces of 7 pixels or more (25 pixels at 75° of tilt).
@@ -189,13 +181,13 @@ def sample_atlas(
     places, counts = _place_grids(layout, picture.shape[2], texture, uv, uv_dx, uv_dy, taps)
     if counts is None:
         return F.grid_sample(picture, torch.stack(places, 1)[None, None], align_corners=False)[0, :, 0].T
-    order, grids = group_by_grid(*counts)
+    order, grids = _group_by_grid(*counts)
     places = torch.stack([values.index_select(0, order) for values in places]).view(3, 2, 1, 1, -1)
     colors = texels.new_empty(len(order), 3)
     for columns, rows, begin, end in grids:
         middle, right, down = places[..., begin:end]
-        across = right * tap_offsets(columns, texels.device)[:, None]
-        points = middle + across + down * tap_offsets(rows, texels.device)[:, None, None]
+        across = right * _tap_offsets(columns, texels.device)[:, None]
+        points = middle + across + down * _tap_offsets(rows, texels.device)[:, None, None]
         tap_colors = F.grid_sample(picture, points.flatten(1, 2).permute(1, 2, 0)[None], align_corners=False)[0]
         # added one after the other, because the rounding of `mean` depends on the number of fragments
         colors[begin:end] = reduce(torch.add, tap_colors.unbind(1)).T / (columns * rows)
@@ -227,3 +219,21 @@ def _place_grids(
             extent = extent.masked_fill(size == 1, 0)  # one texel: one color everywhere
             steps.append([side * extent / count for side, count in zip(sides[axis], counts, strict=True)])
     return [*middles, *chain.from_iterable(zip(*steps, strict=True))], counts
+
+
+def _group_by_grid(across: Tensor, down: Tensor) -> tuple[Tensor, list[tuple[int, int, int, int]]]:
+    """Sort footprints by grid, stably. Return that order, and each grid's (columns, rows, first, end) in it."""
+    base = 1 << 7
+    sorted_keys, order = (across * base + down).sort(stable=True)
+    keys, sizes = sorted_keys.unique_consecutive(return_counts=True)
+    grids, first = [], 0
+    for key, size in torch.stack([keys, sizes]).T.tolist():
+        grids.append((*divmod(key, base), first, first + size))
+        first += size
+    return order, grids
+
+
+@lru_cache
+def _tap_offsets(count: int, device: torch.device) -> Tensor:
+    """Return the offsets of `count` taps, one apart round 0."""
+    return torch.arange(count, device=device) - (count - 1) / 2

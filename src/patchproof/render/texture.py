@@ -12,12 +12,14 @@ from 16×16 samples per pixel, this grid 33 to 57. Left out on purpose: filters 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import chain
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+
+CHUNK = 1 << 15  # fragments whose taps are found at a time, 128 each at most
 
 
 @dataclass(frozen=True)
@@ -36,9 +38,10 @@ class TexelLayout:
     pitch: int | None = None
 
     def place(self, texture: Tensor, level: Tensor | int) -> tuple[Tensor, Tensor]:
-        """Return (width and height P×2 float, first texel P) of levels of textures."""
-        place = self.places.index_select(0, texture * (len(self.places) // len(self.levels)) + level)
-        return place[:, :2].float(), place[:, 2]
+        """Return (width and height 2×P float, first texel P int32) of levels of textures."""
+        row = texture * (len(self.places) // len(self.levels)) + level
+        place = self.places.T.contiguous().index_select(1, row)
+        return place[:2].float(), place[2].int()
 
 
 @dataclass(frozen=True)
@@ -130,28 +133,27 @@ def footprint(
     pixel. There are at most `taps` along its shorter side and twice as many along the longer one; with `taps` = 1 there
     is one. Texels are points to interpolate between, or `blocks` of one color, like printed pixels.
     """
-    uv, uv_dx, uv_dy = (values.contiguous() for values in (uv, uv_dx, uv_dy))
+    uv, uv_dx, uv_dy = (values.T.contiguous() for values in (uv, uv_dx, uv_dy))
     size, _ = layout.place(texture, 0)
-    spans = _length(uv_dx * size), _length(uv_dy * size)
+    spans = _lengths(uv_dx * size), _lengths(uv_dy * size)
     level, counts = tap_grids(*spans, layout.levels.index_select(0, texture), taps)
-    size, offset = layout.place(texture, level)
-    tap_arguments = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
-    if counts is None:
-        texel, weight = _taps(*tap_arguments, 1, 1, layout, blocks)
-        first = torch.arange(0, texel.numel() + 1, 4, dtype=torch.int, device=texel.device)
-        return Footprint(texel.flatten(), weight.flatten(), first)
-    first = F.pad((4 * counts[0].int() * counts[1]).cumsum(0, dtype=torch.int), (1, 0))
-    texel = torch.empty(int(first[-1]), dtype=torch.int, device=uv.device)
-    weight = texel.new_empty(texel.shape, dtype=torch.float32)
-    order, grids = group_by_grid(*counts)
-    for columns, rows, begin, end in grids:
-        fragment = order[begin:end]
-        center, dx, dy, level_size, corner = (values.index_select(0, fragment) for values in tap_arguments)
-        seen = _taps(center, dx, dy, level_size, corner, columns, rows, layout, blocks)
-        place = first.index_select(0, fragment)[:, None] + torch.arange(4 * columns * rows, device=uv.device)
-        for table, values in zip((texel, weight), seen, strict=True):
-            table.scatter_(0, place.flatten(), values.flatten())  # a quarter of an index's time
-    return Footprint(texel, weight, first)
+    columns, rows = counts or [torch.ones_like(level)] * 2
+    size, corner = layout.place(texture, level)
+    step_x, step_y, total = uv_dx * size / columns, uv_dy * size / rows, columns.int() * rows
+    middle = uv * size - 0.5 - step_x * ((columns - 1) / 2) - step_y * ((rows - 1) / 2)  # of the first tap
+    per_cell = 1 / _lengths(torch.stack([step_x, step_y])).clamp_(1e-6, 1)
+    grids = torch.cat([middle, step_x, step_y, size, per_cell, torch.stack([columns, 1 / total])])
+    first = F.pad(total.cumsum(0, dtype=torch.int), (1, 0))
+    texel = torch.empty(int(first[-1]), 4, dtype=torch.int, device=uv.device)
+    weight, done = torch.empty(texel.shape, device=uv.device), 0
+    for start in range(0, len(total), CHUNK):
+        part = slice(start, start + CHUNK)
+        owner = torch.repeat_interleave(total[part])
+        taps = slice(done, done := done + len(owner))
+        number = torch.arange(taps.start, taps.stop, device=uv.device) - first[part].index_select(0, owner)
+        grid, corners = grids[:, part].index_select(1, owner), corner[part].index_select(0, owner)
+        _write_taps(texel[taps], weight[taps], grid, number, corners, layout.wrap, blocks)
+    return Footprint(texel.flatten(), weight.flatten(), 4 * first)
 
 
 def tap_grids(across: Tensor, down: Tensor, levels: Tensor, taps: int) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
@@ -167,21 +169,9 @@ def tap_grids(across: Tensor, down: Tensor, levels: Tensor, taps: int) -> tuple[
     return level, (across, down)
 
 
-def group_by_grid(across: Tensor, down: Tensor) -> tuple[Tensor, list[tuple[int, int, int, int]]]:
-    """Sort footprints by grid, stably. Return that order, and each grid's (columns, rows, first, end) in it."""
-    base = 1 << 7
-    sorted_keys, order = (across * base + down).sort(stable=True)
-    keys, sizes = sorted_keys.unique_consecutive(return_counts=True)
-    grids, first = [], 0
-    for key, size in torch.stack([keys, sizes]).T.tolist():
-        grids.append((*divmod(key, base), first, first + size))
-        first += size
-    return order, grids
-
-
-def _length(vectors: Tensor) -> Tensor:
-    x, y = vectors.unbind(-1)
-    return (x * x + y * y).sqrt()
+def _lengths(vectors: Tensor) -> Tensor:
+    x, y = vectors
+    return (x * x).add_(y * y).sqrt_()
 
 
 def _levels(shorter: Tensor, longer: Tensor, taps: int, max_taps: int) -> Tensor:
@@ -191,53 +181,36 @@ def _levels(shorter: Tensor, longer: Tensor, taps: int, max_taps: int) -> Tensor
     return coarse.clamp_min(0).long()
 
 
-def _taps(
-    center: Tensor,
-    step_x: Tensor,
-    step_y: Tensor,
-    size: Tensor,
-    offset: Tensor,
-    columns: int,
-    rows: int,
-    layout: TexelLayout,
-    blocks: bool,
-) -> tuple[Tensor, Tensor]:
-    """Return texels and weights G×(4·rows·columns) of a grid of taps round `center` G×2, in texels of one level. A tap
-    between points is bilinear. On blocks it is the mean over its cell, exactly if cell and blocks are parallel.
+def _write_taps(
+    texel: Tensor, weight: Tensor, grid: Tensor, number: Tensor, corner: Tensor, wrap: bool, blocks: bool
+) -> None:
+    """Write the texels and weights T×4 of taps with this `number` in their `grid` 12×T, whose level begins at the texel
+    `corner`. A tap between points is bilinear. On blocks it is the mean over its cell, exactly if cell and blocks are
+    parallel.
     """
-    step_x, step_y = step_x / columns, step_y / rows
-    position = center[:, :, None, None] + step_x[:, :, None, None] * tap_offsets(columns, center.device)
-    position = position + step_y[:, :, None, None] * tap_offsets(rows, center.device)[:, None]
-    size = size[:, :, None, None]
-    if layout.wrap:
-        position = position - (position / size).floor() * size
+    middle, step_x, step_y, size, per_cell = grid[:10].view(5, 2, -1)
+    columns, mean = grid[10:]
+    row = ((number + 0.5) / columns).floor_()
+    position = middle + step_x * (number - row * columns) + step_y * row
+    if wrap:
+        position -= (position / size).floor_() * size
         low = torch.minimum(position.floor(), size - 1)  # rounding may leave a wrapped place at the size itself
     else:
-        position = torch.clamp(position, torch.zeros_like(size), size - 1)
+        position = torch.minimum(position.clamp_min_(0), size - 1)
         low = position.floor()
     share = position.sub_(low)
     if blocks:
-        per_cell = 1 / (step_x * step_x + step_y * step_y).sqrt().clamp(1e-6, 1)[:, :, None, None]
-        share = torch.addcmul(0.5 - 0.5 * per_cell, share, per_cell).clamp_(0, 1)
-    x, y = share.unbind(1)
-    stride = size[:, 0].int() + 1
-    texel = torch.empty(len(center), 4, rows, columns, dtype=torch.int, device=center.device)
-    low = low.int()
-    first = torch.add(low[:, 1] * stride, low[:, 0] + offset[:, None, None].int(), out=texel[:, 0])
-    torch.add(first, 1, out=texel[:, 1])
-    torch.add(texel[:, :2], stride[:, None], out=texel[:, 2:])
-    weight = torch.empty(len(center), 4, rows, columns, device=center.device)
-    below = y / (rows * columns)
-    above = 1 / (rows * columns) - below
-    torch.sub(above, torch.mul(above, x, out=weight[:, 1]), out=weight[:, 0])
-    torch.sub(below, torch.mul(below, x, out=weight[:, 3]), out=weight[:, 2])
-    return texel.flatten(1), weight.flatten(1)
-
-
-@lru_cache
-def tap_offsets(count: int, device: torch.device) -> Tensor:
-    """Return the offsets of `count` taps, one apart round 0."""
-    return torch.arange(count, device=device) - (count - 1) / 2
+        share = ((share - 0.5) * per_cell).add_(0.5).clamp_(0, 1)
+    (low_x, low_y), (x, y), stride = low.int(), share, size[0].int() + 1
+    above = low_y * stride + low_x + corner
+    for column, first in ((0, above), (2, above + stride)):
+        texel[:, column] = first
+        torch.add(first, 1, out=texel[:, column + 1])
+    below = y * mean
+    for column, both in ((0, mean - below), (2, below)):
+        right = both * x
+        torch.sub(both, right, out=weight[:, column])
+        weight[:, column + 1] = right
 
 
 def look_up(footprint: Footprint, texels: Tensor) -> Tensor:
