@@ -7,7 +7,6 @@ bare object in even light, seen straight from one side.
 """
 
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,11 +21,11 @@ from patchproof.base.text import brief
 from patchproof.channel import camera as camera_model
 from patchproof.channel.camera import add_noise, develop, gaussian_blur, is_pointwise, reach_px
 from patchproof.channel.effects import Light, Pose
-from patchproof.channel.printer import MOTTLE_CELLS, mottle_cells, mottled, print_change, vary_print
+from patchproof.channel.printer import mottle_cells, mottled, print_change, vary_print
 from patchproof.render.pixels import Appearance, ObjectTextures, PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels
-from patchproof.render.texture import look_up, texel_table
+from patchproof.render.texture import look_up
 from patchproof.render.views import Views, relight, render_views
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
@@ -136,28 +135,18 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     has_mottle = variation.mottle.any()
     seen = look_up(piece.texels, picture.codes if views.reduced else picture.light)
     if has_mottle:
-        seen = mottled(seen if views.reduced else srgb_from_linear(seen), _mottle(views, picture))
+        seen = mottled(seen if views.reduced else srgb_from_linear(seen), _mottle(views))
     reflectance = linear_from_srgb(seen) if views.reduced or has_mottle else seen
     change = torch.as_tensor(print_change(variation)).to(reflectance)
     return vary_print(reflectance, change.index_select(0, piece.view)) * views.piece_white
 
 
-def _mottle(views: Views, picture: PiecePicture) -> Tensor:
+def _mottle(views: Views) -> Tensor:
     """Return what each print's mottle adds to the piece's pixels, P×3 in sRGB."""
-    piece, variation = views.on_piece, views.conditions.print
-    cell = _cell_of_texel(picture.size_px, piece.view.device).index_select(0, piece.texels.texel)
-    first = (piece.view * MOTTLE_CELLS**2).int().index_select(0, piece.texels.fragment)
+    variation = views.conditions.print
     prints = zip(variation.mottle, variation.mottle_seed, strict=True)
     cells = np.concatenate([rms * mottle_cells(int(seed)) for rms, seed in prints])
-    return look_up(replace(piece.texels, texel=cell.add_(first)), torch.as_tensor(cells).to(picture.codes))
-
-
-@lru_cache(maxsize=4)
-def _cell_of_texel(size_px: tuple[int, int], device: torch.device) -> Tensor:
-    """Return the cell of a print's mottle in which each texel of a picture's levels has its middle."""
-    across, down = ((torch.arange(n) + 0.5) * (MOTTLE_CELLS / max(size_px)) for n in size_px)
-    middle = texel_table([torch.stack(torch.meshgrid(down, across, indexing="ij"), -1)], wrap=False).long()
-    return (middle[:, 0] * MOTTLE_CELLS + middle[:, 1]).int().to(device)
+    return look_up(views.on_piece.mottle_cells, torch.as_tensor(cells, dtype=torch.float32, device=views.stage.device))
 
 
 def _paste_piece(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:

@@ -6,8 +6,8 @@ along each of the piece's sides, that lies within the cut line.
 """
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.geometry import dot
+from patchproof.channel.printer import MOTTLE_CELLS
 from patchproof.render.fragments import Fragments
 from patchproof.render.surfaces import ObjectSurface, PieceSurface, sample_atlas
 from patchproof.render.texture import Footprint, footprint, texel_layout, texel_table
@@ -106,20 +107,36 @@ class PiecePixels:
     view: Tensor
     share: Tensor
     texels: Footprint
+    size_px: tuple[int, int]  # of the piece
     normal: Tensor  # 3×P
     white: Tensor | None
     back_pixel: Tensor  # pixels that see its back
     back_share: Tensor
     box_px: np.ndarray
 
+    @cached_property
+    def mottle_cells(self) -> Footprint:
+        """The cells of the prints' mottle that the pixels see, those of each view after the ones before."""
+        cell = _cell_of_texel(self.size_px, self.view.device).index_select(0, self.texels.texel)
+        first = (self.view * MOTTLE_CELLS**2).int().index_select(0, self.texels.fragment)
+        return replace(self.texels, texel=cell.add_(first))
+
     def part(self, views: range, pixels: int) -> "PiecePixels":
         """Return those of some views, of `pixels` pixels each, equal to those of these views alone."""
         rows, back = (_rows(pixel, views, pixels) for pixel in (self.pixel, self.back_pixel))
         pixel, view = self.pixel[rows] - views.start * pixels, self.view[rows] - views.start
         texels, white = self.texels.part(rows.start, rows.stop), None if self.white is None else self.white[rows]
-        front = (pixel, view, self.share[rows], texels, self.normal[:, rows], white)
+        front = (pixel, view, self.share[rows], texels, self.size_px, self.normal[:, rows], white)
         back_pixel, box_px = self.back_pixel[back] - views.start * pixels, self.box_px[views.start : views.stop]
         return PiecePixels(*front, back_pixel, self.back_share[back], box_px)
+
+
+@lru_cache(maxsize=4)
+def _cell_of_texel(size_px: tuple[int, int], device: torch.device) -> Tensor:
+    """Return the cell of a print's mottle in which each texel of a picture's levels has its middle."""
+    across, down = ((torch.arange(n) + 0.5) * (MOTTLE_CELLS / max(size_px)) for n in size_px)
+    middle = texel_table([torch.stack(torch.meshgrid(down, across, indexing="ij"), -1)], wrap=False).long()
+    return (middle[:, 0] * MOTTLE_CELLS + middle[:, 1]).int().to(device)
 
 
 def _rows(pixel: Tensor, views: range, pixels: int) -> slice:
@@ -158,7 +175,8 @@ def piece_pixels(
     white = None if white_coefficients is None else _paper_light(white_coefficients[visible.view], 2 * mm / size - 1)
     front_share, back_share = (share.index_select(0, side)[:, None] for side in (front, back))
     box_px = _boxes(torch.cat([visible.pixel, back_pixel]), fragments.shape)
-    return PiecePixels(visible.pixel, visible.view, front_share, texels, normal, white, back_pixel, back_share, box_px)
+    seen = (visible.pixel, visible.view, front_share, texels, piece.size_px, normal, white)
+    return PiecePixels(*seen, back_pixel, back_share, box_px)
 
 
 def _boxes(pixel: Tensor, shape: tuple[int, int, int]) -> np.ndarray:

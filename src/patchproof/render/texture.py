@@ -59,7 +59,7 @@ class Footprint:
         low, high = torch.stack([self.first[first], self.first[last]]).tolist()
         return Footprint(self.texel[low:high], self.weight[low:high], self.first[first : last + 1] - low)
 
-    @cached_property
+    @property
     def fragment(self) -> Tensor:
         """L: the fragment that sees each texel."""
         return torch.repeat_interleave(self.first.diff(), output_size=len(self.texel)).int()

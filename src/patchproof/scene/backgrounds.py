@@ -27,7 +27,7 @@ import numpy as np
 from patchproof.base.color import codes_from_srgb
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder, open_image
-from patchproof.base.resample import halving_pyramid, index_homography
+from patchproof.base.resample import halving_pyramid
 from patchproof.base.settings import BackgroundSettings
 from patchproof.base.validation import expand_path
 from patchproof.photo.read import allow_heic, list_images, read_photo
@@ -220,12 +220,17 @@ class Backgrounds:
             side = min(crop_w, crop_h)
             x0, y0, crop_w, crop_h = x0 + (crop_w - side) / 2, y0 + (crop_h - side) / 2, side, side
         shrunk = levels[max(i for i in range(len(shapes)) if i == 0 or crop_w / 2**i >= size_px[0])]
-        sx, sy = shrunk.shape[1] / width, shrunk.shape[0] / height
-        scale_x, scale_y = crop_w * sx / size_px[0], crop_h * sy / size_px[1]
-        matrix = index_homography(np.array([[scale_x, 0, x0 * sx], [0, scale_y, y0 * sy], [0, 0, 1.0]]))
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        picture = cv2.warpAffine(shrunk, matrix[:2], size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        rows = _whole_pixels(y0 / height, crop_h / height, shrunk.shape[0])
+        columns = _whole_pixels(x0 / width, crop_w / width, shrunk.shape[1])
+        picture = cv2.resize(shrunk[rows, columns], size_px)  # a third of a warp's time
         return cv2.flip(picture, 1) if choice[4] < 0.5 else picture
+
+
+def _whole_pixels(first: float, size: float, side_px: int) -> slice:
+    """Return the pixels of a side that a crop takes, given as shares of the side."""
+    size_px = max(1, round(size * side_px))
+    first_px = min(round(first * side_px), side_px - size_px)
+    return slice(first_px, first_px + size_px)
 
 
 def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
