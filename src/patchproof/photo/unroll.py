@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from patchproof.base.geometry import apply_homography, fit_homography, is_inside, plane_pose, rect_corners
@@ -191,6 +190,8 @@ def _flatten(srgb, project, px_from_mm, rect_mm, margin_px: float) -> np.ndarray
 
 def fit_cylinder(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CORNER_NOISE_PX) -> Shape | None:
     """Fit paper on a cylinder: the best of the fits from several starts; None if it is flat or bent by over 90°."""
+    from scipy.optimize import least_squares  # a fifth of a second, which flat paper need not wait for
+
     center, half_mm = mm.mean(0), np.ptp(mm, axis=0).max() / 2
     middle = np.array(size) / 2
     focal = focal_px or _TYPICAL_FOCAL * np.hypot(*size)
@@ -284,6 +285,8 @@ def _starts(flat, mm, px, camera, center, half_mm) -> list[tuple[float, float]]:
 
 def fit_radial_lens(flat, mm, px, size) -> Shape:
     """Fit a plane seen through a lens with one radial term about the picture's middle."""
+    from scipy.optimize import least_squares
+
     middle, half = np.array(size) / 2, np.hypot(*size) / 2
 
     def project(p, points):

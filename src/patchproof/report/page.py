@@ -13,8 +13,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
+from patchproof.base.color import codes_from_srgb
 from patchproof.base.input import is_file, read_file
 from patchproof.base.intervals import Estimate
 from patchproof.base.output import image_bytes, make_folder, write_atomically
@@ -96,9 +98,8 @@ def _path(folder: Path, file: str, kind: str) -> Path:
 
 def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
     """Draw ΔE00 cells as uint8 RGBA squares: pale is 0, dark is `DELTA_TOP` or more, transparent is not measured."""
-    import matplotlib
-
-    colors = matplotlib.colormaps["magma_r"](np.clip(np.nan_to_num(delta_e00) / DELTA_TOP, 0, 1), bytes=True)
+    light = 255 - codes_from_srgb(np.nan_to_num(delta_e00) / DELTA_TOP)
+    colors = cv2.cvtColor(cv2.applyColorMap(light, cv2.COLORMAP_MAGMA), cv2.COLOR_BGR2RGBA)
     colors[np.isnan(delta_e00), 3] = 0
     zoom = max(1, longer_px // max(delta_e00.shape))
     return np.repeat(np.repeat(colors, zoom, axis=0), zoom, axis=1)
