@@ -32,7 +32,7 @@ def test_what_is_seen_in_an_atlas_is_what_footprints_see(taps):
     own, at = textures(), fragments()
     where = atlas_layout(SIZES)
     seen = sample_atlas(where, atlas_table(own, where), *at, taps)
-    told = look_up(footprint(texel_layout(list(SIZES), wrap=True), *at, taps), texel_table(own, wrap=True))
+    told = look_up(footprint(texel_layout(list(SIZES), wrap=True), *at, taps), texel_table(own))
     torch.testing.assert_close(seen, told, atol=PLACED, rtol=0)
 
 
@@ -61,4 +61,4 @@ def test_each_fragment_sees_to_the_bit_what_it_would_alone():
 def test_shelves_waste_little_where_textures_are_of_many_sizes(sizes, most):
     """Beside tables without margins; narrow textures have most of them."""
     own, where = [torch.zeros(height, width, 3) for width, height in sizes], atlas_layout(sizes)
-    assert len(atlas_table(own, where)) < most * len(texel_table(own, wrap=True))
+    assert len(atlas_table(own, where)) < most * len(texel_table(own))

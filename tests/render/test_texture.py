@@ -14,7 +14,7 @@ from patchproof.render.texture import footprint, look_up, texel_layout, texel_ta
 
 
 def look(texture, uv, dx, dy, wrap=False, taps=4, blocks=False):
-    return look_up(seen_at(texture, uv, dx, dy, wrap, taps, blocks), texel_table([texture], wrap))
+    return look_up(seen_at(texture, uv, dx, dy, wrap, taps, blocks), texel_table([texture]))
 
 
 def seen_at(texture, uv, dx, dy, wrap=False, taps=4, blocks=False):
@@ -140,7 +140,7 @@ def test_several_textures_of_different_sizes_do_not_mix():
     texture = torch.tensor([0, 1, 2]).repeat(20)
     derivative = torch.rand(60, 2, generator=torch.Generator().manual_seed(1)) * 0.6
     seen = footprint(where, texture, torch.rand(60, 2) * 9 - 4, derivative, derivative.flip(1), 4)
-    seen = look_up(seen, texel_table(textures, wrap=True))
+    seen = look_up(seen, texel_table(textures))
     expected = torch.tensor([0.1, 0.5, 0.9])[texture][:, None].expand(60, 3)
     torch.testing.assert_close(seen, expected, atol=1e-6, rtol=0)
 
@@ -240,6 +240,6 @@ def test_tables_of_large_textures_take_seconds():
     """2048² in 0.2 s and 0.4 GB; 4096², the largest that meshes keep, 0.6 s and 1.3 GB (one core)."""
     texture = torch.zeros(2048, 2048, 3)
     start = time.perf_counter()
-    table = texel_table([texture], wrap=True)
+    table = texel_table([texture])
     assert time.perf_counter() - start < 3
-    assert len(table) == sum((max(2048 >> k, 1) + 1) ** 2 for k in range(12))
+    assert len(table) == sum(max(2048 >> k, 1) ** 2 for k in range(12))

@@ -434,7 +434,7 @@ def test_a_bent_piece_is_hidden_where_the_mug_is_in_front(tmp_path, side, family
     v, u = torch.meshgrid(*((torch.arange(256) + 0.5) / 256,) * 2, indexing="ij")
     where = PiecePicture.of(torch.stack([u, v, u], -1))
     seen = render_views(set_stage(scene), where, conditions, (128, 128))
-    at = look_up(seen.piece.texels, texel_table([where.srgb], False))[:, :2].numpy() * scene.placement.size_mm
+    at = look_up(seen.piece.texels, texel_table([where.srgb]))[:, :2].numpy() * scene.placement.size_mm
     poses = scene.camera_from_world(conditions)[seen.piece.view.numpy()]
     eyes = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     points = scene.placement.world(at)

@@ -48,18 +48,18 @@ class PiecePicture:
     @classmethod
     def of(cls, srgb: Tensor) -> "PiecePicture":
         """Return the piece that looks like H×W×3."""
-        return cls(texel_table([srgb], wrap=False), (srgb.shape[1], srgb.shape[0]))
+        return cls(texel_table([srgb]), (srgb.shape[1], srgb.shape[0]))
 
     @property
     def srgb(self) -> Tensor:
         """The picture H×W×3."""
         width, height = self.size_px
-        return self.codes[: (height + 1) * (width + 1)].view(height + 1, width + 1, 3)[:height, :width]
+        return self.codes[: height * width].view(height, width, 3)
 
     @cached_property
     def light(self) -> Tensor:
         """The texels averaged as linear light; they take a fifth of a photograph's time, and are computed once."""
-        return texel_table([linear_from_srgb(self.srgb)], wrap=False)
+        return texel_table([linear_from_srgb(self.srgb)])
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class PiecePixels:
 def _cell_of_texel(size_px: tuple[int, int], device: torch.device) -> Tensor:
     """Return the cell of a print's mottle in which each texel of a picture's levels has its middle."""
     across, down = ((torch.arange(n) + 0.5) * (MOTTLE_CELLS / max(size_px)) for n in size_px)
-    middle = texel_table([torch.stack(torch.meshgrid(down, across, indexing="ij"), -1)], wrap=False).long()
+    middle = texel_table([torch.stack(torch.meshgrid(down, across, indexing="ij"), -1)]).long()
     return (middle[:, 0] * MOTTLE_CELLS + middle[:, 1]).int().to(device)
 
 

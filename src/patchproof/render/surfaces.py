@@ -84,7 +84,7 @@ def light_texels(textures_srgb: Sequence[Tensor], reduced: bool, atlas: TexelLay
     """Return the T×3 linear light of textures that repeat, their mip levels averaged as light or, `reduced`, as code
     values; differentiable except in an `atlas`.
     """
-    table = partial(texel_table, wrap=True) if atlas is None else partial(atlas_table, layout=atlas)
+    table = texel_table if atlas is None else partial(atlas_table, layout=atlas)
     if reduced:
         return linear_from_srgb(table(list(textures_srgb)))
     return table([linear_from_srgb(texture) for texture in textures_srgb])

@@ -26,10 +26,9 @@ CHUNK = 1 << 15  # fragments whose taps are found at a time, 128 each at most
 class TexelLayout:
     """The positions of the mip levels of K textures in one T×3 table of texels.
 
-    `places` (K·L)×3 holds each level's width, height and first texel; `levels` K, how many of the L a texture has. A
-    level is stored with one more row and column, for bilinear taps beyond its last texel: copies of the first ones if
-    textures repeat (`wrap`), else of the last. Its rows follow each other, or lie `pitch` texels apart in one picture
-    (surfaces.py).
+    `places` (K·L)×3 holds each level's width, height and first texel; `levels` K, how many of the L a texture has.
+    Beyond its last row and column follow the first ones if textures repeat (`wrap`), else the last again. Rows follow
+    each other, or lie `pitch` texels apart in one picture (surfaces.py).
     """
 
     places: Tensor
@@ -82,17 +81,15 @@ def texel_layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device 
             w, h = max(width >> level, 1), max(height >> level, 1)
             levels.append((w, h, offset))
             if level < max(width, height).bit_length():
-                offset += (w + 1) * (h + 1)
+                offset += w * h
         table.append(levels)
     levels = torch.tensor([max(size).bit_length() for size in sizes], device=device)
     return TexelLayout(torch.tensor(table, device=device).flatten(0, 1), levels, wrap)
 
 
-def texel_table(textures: list[Tensor], wrap: bool) -> Tensor:
+def texel_table(textures: list[Tensor]) -> Tensor:
     """Return the T×3 texels of all mip levels of H×W×3 textures, in the order of `texel_layout`; differentiable."""
-    mode, levels = "circular" if wrap else "replicate", chain.from_iterable(map(mip_levels, textures))
-    padded = (F.pad(level.permute(2, 0, 1)[None], (0, 1, 0, 1), mode) for level in levels)
-    return torch.cat([level.flatten(2) for level in padded], 2).squeeze(0).T.contiguous()
+    return torch.cat([level.flatten(0, 1) for level in chain.from_iterable(map(mip_levels, textures))])
 
 
 def mip_levels(texture: Tensor) -> Iterator[Tensor]:
@@ -201,16 +198,17 @@ def _write_taps(
     share = position.sub_(low)
     if blocks:
         share = ((share - 0.5) * per_cell).add_(0.5).clamp_(0, 1)
-    (low_x, low_y), (x, y), stride = low.int(), share, size[0].int() + 1
-    above = low_y * stride + low_x + corner
-    for column, first in ((0, above), (2, above + stride)):
+    width, right_and_below = size[0].int(), torch.where(low + 1 < size, 1, 1 - size if wrap else 0).int()
+    (low_x, low_y), (x, y), (right, below) = low.int(), share, right_and_below
+    above = low_y * width + low_x + corner
+    for column, first in ((0, above), (2, above + below * width)):
         texel[:, column] = first
-        torch.add(first, 1, out=texel[:, column + 1])
-    below = y * mean
-    for column, both in ((0, mean - below), (2, below)):
-        right = both * x
-        torch.sub(both, right, out=weight[:, column])
-        weight[:, column + 1] = right
+        torch.add(first, right, out=texel[:, column + 1])
+    lower = y * mean
+    for column, both in ((0, mean - lower), (2, lower)):
+        other = both * x
+        torch.sub(both, other, out=weight[:, column])
+        weight[:, column + 1] = other
 
 
 def look_up(footprint: Footprint, texels: Tensor) -> Tensor:
