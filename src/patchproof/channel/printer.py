@@ -241,9 +241,11 @@ def _moved(table: Tensor, device: torch.device, dtype: torch.dtype) -> Tensor:
 
 def _look_up(table: Tensor, srgb: Tensor) -> Tensor:
     colors = srgb if srgb.dtype == torch.float64 else srgb.float()  # half precision cannot address 33 nodes finely
-    levels = 255 * clamp_to_unit(colors)
-    position = torch.where(levels <= 248, levels / 8, 31 + (levels - 248) / 7)  # the last step is 7 wide
-    grid = (2 * (position + 1) / (SIZE + 1) - 1).movedim(1, -1).flip(-1)  # grid_sample wants (x, y, z) = (b, g, r)
+    unit = clamp_to_unit(colors)
+    # nodes are 8 levels apart, the last two 7; the table and its border reach from -1 to 1, white lies at `end`
+    (slope, last), end = (2 * 255 / (step * (SIZE + 1)) for step in (8, 7)), (SIZE - 1) / (SIZE + 1)
+    place = torch.where(unit <= 248 / 255, unit * slope - end, unit * last + (end - last))
+    grid = place.movedim(1, -1).flip(-1)  # grid_sample wants (x, y, z) = (b, g, r)
     sample, table = torch.nn.functional.grid_sample, _moved(table, colors.device, colors.dtype)
     values = sample(table, grid[None], mode="bilinear", padding_mode="border", align_corners=True)
     return values.squeeze(0).movedim(0, 1).to(srgb.dtype)

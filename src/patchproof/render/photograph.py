@@ -97,8 +97,9 @@ def expose(views: Views, appearance: Appearance, jpeg: bool = True) -> Tensor:
     if appearance is not None:
         # if each pixel is developed alone, only the piece's pixels differ from the bare object's photograph
         piece, pixels = views.on_piece, views.frame_px[0] * views.frame_px[1]
-        back = views.encode(image.new_full((1, 1), PAPER_BACK_LINEAR), piece.back_pixel // pixels)
-        image = _blend(image, piece.back_pixel, piece.back_share, back, False)
+        if len(piece.back_pixel):
+            back = views.encode(image.new_full((1, 1), PAPER_BACK_LINEAR), piece.back_pixel // pixels)
+            image = _blend(image, piece.back_pixel, piece.back_share, back, False)
         light = _piece_light(views, appearance)
         image = _blend(image, piece.pixel, piece.share, views.encode(light, piece.view), False)
     return _smooth(views, image, by_code=False)

@@ -168,7 +168,7 @@ def atlas_table(textures: Sequence[Tensor], layout: TexelLayout) -> Tensor:
         for level, (w, h, first) in zip(mip_levels(texture), rows, strict=False):
             y, x = (corner - _MARGIN for corner in divmod(first, layout.pitch))
             down, across = (torch.arange(-_MARGIN, side + _MARGIN, device=table.device) % side for side in (h, w))
-            table[y : y + len(down), x : x + len(across)] = level[down][:, across]
+            table[y : y + len(down), x : x + len(across)] = level[:, down][:, :, across].permute(1, 2, 0)
     return table.flatten(0, 1)
 
 

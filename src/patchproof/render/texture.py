@@ -89,23 +89,18 @@ def texel_layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device 
 
 def texel_table(textures: list[Tensor]) -> Tensor:
     """Return the T×3 texels of all mip levels of H×W×3 textures, in the order of `texel_layout`; differentiable."""
-    return torch.cat([level.flatten(0, 1) for level in chain.from_iterable(map(mip_levels, textures))])
+    levels = chain.from_iterable(map(mip_levels, textures))
+    return torch.cat([level.flatten(1) for level in levels], 1).T.contiguous()
 
 
 def mip_levels(texture: Tensor) -> Iterator[Tensor]:
-    """Yield a texture H×W×3, its half, and so on down to one texel."""
-    yield texture
+    """Yield a texture H×W×3 as 3×H×W, its half, and so on down to one texel."""
+    level = texture.permute(2, 0, 1)
+    yield level
     for _ in range(max(texture.shape[:2]).bit_length() - 1):
-        texture = _half_size(texture)
-        yield texture
-
-
-def _half_size(level: Tensor) -> Tensor:
-    """Return H×W×3 with half the rows and columns."""
-    if level.shape[0] % 2 or level.shape[1] % 2:
-        return _half_rows(_half_rows(level).transpose(0, 1)).transpose(0, 1)
-    # the same, with a tenth of the operations
-    return F.avg_pool2d(level.permute(2, 0, 1)[None], 2).squeeze(0).permute(1, 2, 0)
+        is_even = not (level.shape[1] % 2 or level.shape[2] % 2)  # the same, with a tenth of the operations
+        level = F.avg_pool2d(level, 2) if is_even else _half_rows(_half_rows(level).mT).mT
+        yield level
 
 
 def _half_rows(level: Tensor) -> Tensor:
@@ -113,14 +108,14 @@ def _half_rows(level: Tensor) -> Tensor:
 
     Of 2m + 1 rows, row i of m covers two and 1/m; weights of Guthe and Heckbert, Non-Power-of-Two Mipmapping (2005).
     """
-    rows = len(level)
+    rows = level.shape[1]
     if rows == 1:
         return level
     if rows % 2 == 0:
-        return (level[0::2] + level[1::2]) / 2
+        return (level[:, 0::2] + level[:, 1::2]) / 2
     half = rows // 2
-    i = torch.arange(half, dtype=level.dtype, device=level.device)[:, None, None]
-    return ((half - i) * level[0:-1:2] + half * level[1::2] + (i + 1) * level[2::2]) / rows
+    i = torch.arange(half, dtype=level.dtype, device=level.device)[:, None]
+    return ((half - i) * level[:, 0:-1:2] + half * level[:, 1::2] + (i + 1) * level[:, 2::2]) / rows
 
 
 def footprint(

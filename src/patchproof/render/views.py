@@ -107,8 +107,8 @@ class Views:
     def bare_exposed(self) -> Tensor:
         """The bare object, its outlines jagged, in a camera without blur and noise, N·H·W × 3 sRGB."""
         # the background has 256 codes per view and channel, which are exposed as a table
-        gain, tone = self._sensor_values.double()[:, None].split(3, 2)
-        codes = lift_tone(encode_light(torch.tensor(LINEAR_FROM_CODE)[:, None] * gain), tone)
+        gain, tone = self._sensor_values[:, None].split(3, 2)
+        codes = lift_tone(encode_light_by_table(torch.tensor(LINEAR_FROM_CODE)[:, None] * gain), tone)
         image = _look_up_codes(self.background, codes.numpy(), self.stage.device)
         if self.object is None:
             return image

@@ -23,7 +23,7 @@ from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import expectation, loop
 from patchproof.optimizer.problem import set_problem
 
-ROUNDS, STEPS = 16, 4  # the first is to warm up
+ROUNDS, STEPS = 12, 8  # the first is to warm up; each renders views of as many steps ahead
 NEW = ROUNDS // 4
 NAMES = [f"label {i}" for i in range(999)] + ["jeep"]
 
