@@ -31,10 +31,11 @@ from patchproof.scene.interface import Scene
 # Of the views of the next steps that a process renders together: 16 at 224 px, of which 2 at a time took 1.5 times as
 # long, 8 at a time 1.1 times.
 AHEAD_PX = 16 * 224**2
-# A run has this many poses, or a quarter as many as views if that is more. Over 18 pairs of object and seed, the loss
-# was 0.7 % [-0.2, 1.5] higher than with one pose for each view, and as many views were recognized. With one background
-# for each pose, too, it was 2 % higher; with one pose for four steps in a row, 25 to 33 %.
-MIN_POSES, VIEWS_PER_POSE = 240, 4
+# A run has this many poses, or a fifth as many as views if that is more. Over 18 pairs of object and seed, the loss was
+# 0.3 % [-1.1, 0.5] lower than with a quarter, and with a quarter 0.7 % [-0.2, 1.5] higher than with one pose for each
+# view; as many views were recognized. With one background for each pose, too, it was 2 % higher; with one pose for four
+# steps in a row, 25 to 33 %.
+MIN_POSES, VIEWS_PER_POSE = 192, 5
 CACHE_PX = 480 * 224**2  # of the views that all processes keep, at 20 to 70 bytes a pixel
 SELECT_CHUNK = 4  # selection views that a process renders together
 

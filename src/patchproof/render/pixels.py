@@ -168,7 +168,7 @@ def piece_pixels(
     # by columns in memory: selecting rows takes thirty times as long there
     mm, mm_dx, mm_dy = (values.T.contiguous().index_select(1, front).T for values in (mm, mm_dx, mm_dy))
     back_pixel = fragments.pixel.index_select(0, back)
-    layout, only = texel_layout([piece.size_px], wrap=False, device=mm.device), mm.new_zeros(len(mm), dtype=torch.long)
+    layout, only = texel_layout([piece.size_px], wrap=False, device=mm.device), mm.new_zeros(1, dtype=torch.long)
     uv, uv_dx, uv_dy = mm / size, mm_dx * look.side / size, mm_dy * look.side / size
     texels = footprint(layout, only, uv, uv_dx, uv_dy, taps=look.piece_taps, blocks=True)
     normal = torch.nn.functional.normalize(_interpolate(surface.corner_normal, visible), dim=-1).T
@@ -194,7 +194,9 @@ def object_pixels(
     """Return the object's pixels, with normals towards the viewer; `fixed` textures are looked up at once."""
     uv, color, normal = (values.T for values in _interpolate(surface.corners, fragments).split((2, 3, 3), 1))
     uv_dx, uv_dy = fragments.derivatives(surface.corner_uv, uv.T)
-    material = surface.material.index_select(0, fragments.face)
+    material = surface.material[:1]
+    if len(surface.textures_srgb) > 1:
+        material = surface.material.index_select(0, fragments.face)
     query = (material, uv.T, uv_dx * look.side, uv_dy * look.side, look.taps)
     texels = None
     if fixed is None:

@@ -121,7 +121,7 @@ def _half_rows(level: Tensor) -> Tensor:
 def footprint(
     layout: TexelLayout, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int, blocks: bool = False
 ) -> Footprint:
-    """Return the footprint of P fragments on `texture` (P, index into the layout); `uv_dx`, `uv_dy` P×2 are uv per
+    """Return the footprint of P fragments on `texture` (P or 1, index into the layout); `uv_dx`, `uv_dy` P×2 are uv per
     pixel. There are at most `taps` along its shorter side and twice as many along the longer one; with `taps` = 1 there
     is one. Texels are points to interpolate between, or `blocks` of one color, like printed pixels.
     """
@@ -169,8 +169,8 @@ def _lengths(vectors: Tensor) -> Tensor:
 def _levels(shorter: Tensor, longer: Tensor, taps: int, max_taps: int) -> Tensor:
     """Return the finest level on which taps are at most a texel apart; a single tap may cover two texels."""
     reach = 2 if max_taps == 1 else 1
-    coarse = torch.maximum((shorter / (reach * taps)).log2(), (longer / (reach * max_taps)).log2()).ceil()
-    return coarse.clamp_min(0).long()
+    coarse = torch.maximum(shorter / (reach * taps), longer / (reach * max_taps)).log2_().ceil_()
+    return coarse.clamp_min_(0).long()
 
 
 def _write_taps(

@@ -2,7 +2,7 @@
 
 In: `suv.toml` and `effects.toml`, the same with every effect on. Out: `step.csv`, in milliseconds: a step of four
 views, selections apart, where poses are seen for the first time and where they come round again, both as often as in a
-run of default length (a quarter and three), and the network's forward and backward pass of four such pictures in the
+run of default length (a fifth and four), and the network's forward and backward pass of four such pictures in the
 same rounds; so many processes share the views, so many threads the pass. Means of each round's medians; of steps with
 new poses means, as a process sees the views of several in one of them. Freed memory is kept as the command line keeps
 it, by the pass, too. Run in this folder, idle: python step.py
@@ -23,8 +23,8 @@ from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import expectation, loop
 from patchproof.optimizer.problem import set_problem
 
-ROUNDS, STEPS = 12, 8  # the first is to warm up; each renders views of as many steps ahead
-NEW = ROUNDS // 4
+ROUNDS, STEPS = 15, 8  # the first is to warm up; each of the new ones renders views of as many steps ahead
+NEW = ROUNDS // expectation.VIEWS_PER_POSE
 NAMES = [f"label {i}" for i in range(999)] + ["jeep"]
 
 
@@ -74,7 +74,7 @@ def measured(name: str, scene: str, processes: int) -> dict:
     asked = pp.load_scene(f"{scene}.toml").settings.changed(optimize={"steps": ROUNDS * STEPS})
     scene = pp.make_scene(asked)
     problem = replace(set_problem(scene, models=models), jobs=processes)
-    expectation.MIN_POSES = 0  # a quarter of the views
+    expectation.MIN_POSES = 0  # a fifth of the views
     pictures = torch.rand(4, 3, problem.training_px, problem.training_px)
     problem.see(None, scene.draw("train", 256), 16)  # makes the places that training knows, once
     running = loop.steps(problem)
@@ -93,7 +93,8 @@ def measured(name: str, scene: str, processes: int) -> dict:
     rounds = call_in_turn({"pass": passes, "step": steps}, ROUNDS - 1)
     running.close()
     parts = {name: (statistics.mean(ms[: NEW - 1]), statistics.mean(ms[NEW - 1 :])) for name, ms in rounds.items()}
-    own_ms, step_ms = ((new + 3 * again) / 4 for new, again in parts.values())
+    share = 1 / expectation.VIEWS_PER_POSE
+    own_ms, step_ms = (share * new + (1 - share) * again for new, again in parts.values())
     times = dict(zip(("new_ms", "again_ms"), parts["step"], strict=True)) | {"step_ms": step_ms, "pass_ms": own_ms}
     return {name: round(value, 1) for name, value in times.items()} | {"ratio": round(step_ms / own_ms, 3)}
 
