@@ -21,7 +21,7 @@ from test_optimize import scene_with
 
 # Of a step of four views, in the two batches that a CPU sees them in, on a carton before a network of one layer, in the
 # mean of eight steps: where poses are seen for the first time, as in one step of four, and where they are seen again.
-# Measured: 1,559 and 15; 833 and 3.
+# Measured: 1,558 and 15; 833 and 3.
 OPERATIONS, WAITS = (1_580, 845), (15, 3)
 # Measured: 19.25 and 15 sent, 11.25 and 2 fetched. Where poses are seen for the first time, numbers of pixels decide
 # how much memory is asked for, and boxes around the piece which layers are computed.

@@ -141,10 +141,10 @@ def footprint(
     for start in range(0, len(total), CHUNK):
         part = slice(start, start + CHUNK)
         owner = torch.repeat_interleave(total[part])
-        taps = slice(done, done := done + len(owner))
-        number = torch.arange(taps.start, taps.stop, device=uv.device) - first[part].index_select(0, owner)
+        found = slice(done, done := done + len(owner))
+        number = torch.arange(found.start, found.stop, device=uv.device) - first[part].index_select(0, owner)
         grid, corners = grids[:, part].index_select(1, owner), corner[part].index_select(0, owner)
-        _write_taps(texel[taps], weight[taps], grid, number, corners, layout.wrap, blocks)
+        _write_taps(texel[found], weight[found], grid, number, corners, layout.wrap, blocks)
     return Footprint(texel.flatten(), weight.flatten(), 4 * first)
 
 
