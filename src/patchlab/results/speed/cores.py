@@ -1,10 +1,10 @@
 """Predict a training step's time on more cores than this machine has, from its parts as measured here.
 
-In: the demo's scene. Out: `cores.csv`: by views of a step, views of a batch and cores the predicted milliseconds of a
-step whose poses have been seen, and how many times as fast that is as one core with the same settings. A step is what
-one process does alone (print, update, send and receive each batch) and the batches of the core that has most of them.
-Assumed: cores are alike, share neither clock nor memory, and nobody waits for a sleeping process. Medians of processor
-time in turn. Run in this folder: python cores.py
+In: the demo's scene, and `suv.toml` before MobileNetV2. Out: `cores.csv`: by network, views of a step, views of a batch
+and cores the predicted milliseconds of a step whose poses have been seen, and how many times as fast that is as one
+core with the same settings. A step is what one process does alone (print, update, send and receive each batch) and the
+batches of the core that has most of them. Assumed: cores are alike, share neither clock nor memory, and nobody waits
+for a sleeping process. Medians of processor time in turn. Run in this folder: python cores.py
 """
 
 import math
@@ -22,15 +22,14 @@ from patchlab.study.measure import call_in_turn, time_call
 from patchproof.app.demo import SCENE
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import expectation, loop
-from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.views import split_views
 
 BATCHES, STEP_VIEWS, CORES, ROUNDS = (1, 2, 4), (4, 8, 16), (1, 2, 4, 8, 16), 12
 
 
-def parts_ms() -> dict[int | str, float]:
+def parts_ms(problem: Problem) -> dict[int | str, float]:
     """Milliseconds of a batch by its views, of what is done once in a step, and of sending a batch and its answer."""
-    problem = set_problem(pp.make_scene(tomllib.loads(SCENE)))
     state, whole = loop.start(problem), expectation.training_views(problem, problem.scene.draw("train", sum(BATCHES)))
     parts = dict(zip(BATCHES, split_views(whole, BATCHES), strict=True))
     printed = problem.subject.print_design(state.design).detach()
@@ -52,10 +51,11 @@ def parts_ms() -> dict[int | str, float]:
 if __name__ == "__main__":
     keep_freed_memory()
     torch.set_num_threads(1)
-    ms, rows = parts_ms(), []
-    for views, size, cores in product(STEP_VIEWS, BATCHES, CORES):
+    problems, rows = map(set_problem, (pp.make_scene(tomllib.loads(SCENE)), pp.load_scene("suv.toml"))), []
+    every = {problem.classifiers[0].name: parts_ms(problem) for problem in problems}
+    for (network, ms), views, size, cores in product(every.items(), STEP_VIEWS, BATCHES, CORES):
         alone, busiest = ms["step"] + views // size * ms[size], math.ceil(views // size / cores) * ms[size]
         step = alone if cores == 1 else ms["step"] + views // size * ms["send"] + busiest
-        row = {"batch_ms": ms[size], "step_ms": step, "times_as_fast": alone / step}
-        rows.append({"views": views, "batch": size, "cores": cores} | {name: round(v, 2) for name, v in row.items()})
+        row = {"network": network, "views": views, "batch": size, "cores": cores, "batch_ms": round(ms[size], 2)}
+        rows.append(row | {"step_ms": round(step, 2), "times_as_fast": round(alone / step, 2)})
     write_rows("cores.csv", rows)

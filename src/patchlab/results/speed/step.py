@@ -93,8 +93,7 @@ def measured(name: str, scene: str, processes: int) -> dict:
     rounds = call_in_turn({"pass": passes, "step": steps}, ROUNDS - 1)
     running.close()
     parts = {name: (statistics.mean(ms[: NEW - 1]), statistics.mean(ms[NEW - 1 :])) for name, ms in rounds.items()}
-    share = 1 / expectation.VIEWS_PER_POSE
-    own_ms, step_ms = (share * new + (1 - share) * again for new, again in parts.values())
+    own_ms, step_ms = (statistics.fmean(ms, (1, expectation.VIEWS_PER_POSE - 1)) for ms in parts.values())
     times = dict(zip(("new_ms", "again_ms"), parts["step"], strict=True)) | {"step_ms": step_ms, "pass_ms": own_ms}
     return {name: round(value, 1) for name, value in times.items()} | {"ratio": round(step_ms / own_ms, 3)}
 
