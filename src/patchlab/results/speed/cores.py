@@ -52,7 +52,7 @@ if __name__ == "__main__":
     keep_freed_memory()
     torch.set_num_threads(1)
     problems, rows = map(set_problem, (pp.make_scene(tomllib.loads(SCENE)), pp.load_scene("suv.toml"))), []
-    every = {problem.classifiers[0].name: parts_ms(problem) for problem in problems}
+    every = {p.classifiers[0].name.rsplit("/")[-1].removesuffix(".onnx"): parts_ms(p) for p in problems}
     for (network, ms), views, size, cores in product(every.items(), STEP_VIEWS, BATCHES, CORES):
         alone, busiest = ms["step"] + views // size * ms[size], math.ceil(views // size / cores) * ms[size]
         step = alone if cores == 1 else ms["step"] + views // size * ms["send"] + busiest
