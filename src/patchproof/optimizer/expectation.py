@@ -28,7 +28,7 @@ from patchproof.render.views import Views, split_views
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 
-# Of the views of the next steps that a process renders together: 16 at 224 px, of which 2 at a time took 1.5 times as
+# Of the views of the next steps that a process renders together: 16 at 224 px, of which 2 at a time took 1.7 times as
 # long, 8 at a time 1.1 times.
 AHEAD_PX = 16 * 224**2
 # A run has this many poses, or a fifth as many as views if that is more. Over 18 pairs of object and seed, the loss was
