@@ -9,6 +9,7 @@ import pytest
 import torch
 from tolerances import FLOAT32
 
+from patchproof.render import texture as texture_module
 from patchproof.render.pixels import PHOTO_SAMPLING
 from patchproof.render.texture import footprint, look_up, texel_layout, texel_table
 
@@ -29,6 +30,16 @@ def centers(width, height):
 
 def per_pixel(width, height):
     return torch.tensor([[1 / width, 0.0]]), torch.tensor([[0.0, 1 / height]])
+
+
+@pytest.mark.parametrize("wrap", [False, True])
+def test_footprints_found_part_by_part_are_those_found_at_once(monkeypatch, wrap):
+    draw = torch.Generator().manual_seed(0)
+    uv, dx, dy = (scale * torch.rand(40, 2, generator=draw) for scale in (1, 0.3, 0.3))
+    whole = seen_at(torch.rand(20, 30, 3), uv, dx, dy, wrap)
+    monkeypatch.setattr(texture_module, "CHUNK", 7)
+    parts = seen_at(torch.rand(20, 30, 3), uv, dx, dy, wrap)
+    assert all(torch.equal(getattr(whole, name), getattr(parts, name)) for name in ("texel", "weight", "first"))
 
 
 def test_a_texture_seen_texel_by_texel_is_itself():
