@@ -274,6 +274,12 @@ def test_no_change_leaves_colors_and_paper_stays_white():
     torch.testing.assert_close(vary_print(torch.ones(4, 3), draws), torch.ones(4, 3))
 
 
+def test_density_is_a_power_of_the_light_down_to_a_thousandth():
+    light, density = torch.tensor([[1e-3, 0.02, 0.5]], dtype=torch.float64), 0.2
+    change = torch.tensor([0, density, 0, 0, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(vary_print(light, change), light ** (1 + density))
+
+
 def test_ink_variation_has_the_size_of_print_to_print_differences():
     seen = colors_of(load_printer("coated").apply(image(random_8bit())))
     draws = torch.rand(64, 1, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 2 - 1

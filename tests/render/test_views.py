@@ -17,12 +17,16 @@ from torch.nn.functional import avg_pool2d
 
 from patchproof.base import geometry
 from patchproof.base.errors import Refused
+from patchproof.mesh.mesh import Material, MeshPart, mesh_from_parts
 from patchproof.optimizer.problem import FIGURE_SAMPLING, set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
+from patchproof.render.fragments import Cameras
 from patchproof.render.photograph import affected_windows, expose, photograph, shade
-from patchproof.render.pixels import PHOTO_SAMPLING, ObjectTextures, PiecePicture
+from patchproof.render.pixels import PHOTO_SAMPLING, ObjectTextures, PiecePicture, object_pixels
+from patchproof.render.raster import rasterize
 from patchproof.render.stage import set_stage
+from patchproof.render.surfaces import object_surface
 from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import relight, relight_and_replace_background, render_views, split_views
 from patchproof.scene.conditions import draw, with_values
@@ -271,6 +275,24 @@ def test_an_object_shown_with_its_own_textures_is_the_bare_object(tmp_path, mesh
     for size in ((96, 96), (800, 600)):
         own = photograph(stage, ObjectTextures(stage.object.textures_srgb), conditions, size, jpeg=False)
         torch.testing.assert_close(own, photograph(stage, None, conditions, size, jpeg=False), atol=BY_TABLE, rtol=0)
+
+
+def test_each_material_shows_its_own_texture():
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float), np.array([[0, 1, 2], [0, 2, 3]])
+    colors = ((255, 0, 0), (0, 0, 255))
+    parts = []
+    for x, color in enumerate(colors):
+        paint = Material(str(x), (1.0, 1.0, 1.0), np.full((4, 4, 3), color, np.uint8))
+        parts.append(MeshPart(square[0] + [x, 0, 0], square[1], paint, square[0][:, :2], None, None))
+    surface = object_surface(mesh_from_parts(parts, 100), torch.device("cpu"))
+    pose = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    pose[:3, 3] = -pose[:3, :3] @ (surface.vertices.double().mean(0) + torch.tensor([0, 0, 200.0]))
+    lens = torch.tensor([[80.0, 0, 32], [0, 80, 32], [0, 0, 1]], dtype=torch.float64)
+    fragments = rasterize(surface.vertices, surface.faces, Cameras(pose[None], lens[None], (64, 64)), 1.0)
+    seen = object_pixels(surface, fragments, PHOTO_SAMPLING, surface.texels(False, fixed=True))
+    shown = torch.tensor(colors)[surface.material[fragments.face]] / 255
+    assert shown.unique(dim=0).shape == (2, 3)
+    torch.testing.assert_close(seen.color.T, shown, atol=BY_TABLE, rtol=0)
 
 
 @pytest.mark.parametrize("line", ["motion_px = [20, 30]", 'file = "phone"', "blur_px = [3, 4]", "noise = [0.1, 0.2]"])

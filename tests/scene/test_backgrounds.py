@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -225,3 +226,10 @@ def test_half_of_the_views_are_mirrored_left_to_right():
     backgrounds, choice = load_backgrounds(BackgroundSettings(), None), [0.3, 0.5, 0.5, 0.5]
     plain, mirrored = (backgrounds.picture(np.array([*choice, side]), (640, 480), (64, 64)) for side in (0.7, 0.3))
     assert np.array_equal(plain[:, ::-1], mirrored) and not np.array_equal(plain, mirrored)
+
+
+@pytest.mark.parametrize("place", [0.0, 0.5, 1.0])
+def test_a_plain_color_is_that_color_wherever_it_is_cropped(place):
+    plain = load_backgrounds(BackgroundSettings(color=(1.0, 0.0, 0.0)), Path())
+    picture = plain.picture(np.array([0, 0, place, place, 0.9]), (400, 300), (40, 30))
+    assert picture.shape == (30, 40, 3) and (picture == [255, 0, 0]).all()
